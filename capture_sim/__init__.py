@@ -1,0 +1,1 @@
+"""The simulated dome: objects, materials, cameras, lights, effects, exact truth."""

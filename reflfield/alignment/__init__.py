@@ -1,0 +1,1 @@
+"""One local frame per texel, found from the data by correlation over SO(3)."""

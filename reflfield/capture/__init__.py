@@ -1,0 +1,1 @@
+"""Cameras, lights, photographs and silhouettes, and the readers that bring them in."""

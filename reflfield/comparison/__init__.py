@@ -1,0 +1,1 @@
+"""Metrics against photographs, held-out evaluation, plots, report."""

@@ -1,0 +1,1 @@
+"""The field in other people's formats."""

@@ -1,0 +1,1 @@
+"""The fitted reflectance field: model, evaluation, file."""

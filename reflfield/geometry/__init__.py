@@ -1,0 +1,1 @@
+"""Visual hull, mesh cleaning, atlas, texel table, visibility."""

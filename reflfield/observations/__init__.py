@@ -1,0 +1,1 @@
+"""Photographs projected into texture space, the out-of-core store, resampling."""

@@ -1,0 +1,1 @@
+"""Rays to pixels: cameras, point lights, environment maps, turntables."""

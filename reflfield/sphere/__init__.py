@@ -1,0 +1,1 @@
+"""Functions and rotations of the sphere: harmonics, Wigner-d, couplings, hemisphere grids."""
