@@ -49,7 +49,7 @@ def first_tap(coordinate: float, side: int) -> tuple[int, float]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _squares(directions, out):  # type: ignore[no-untyped-def]
+def _squares(directions: NDArray[np.floating], out: NDArray[np.float64]) -> None:
     for i in range(directions.shape[0]):
         u, v = square_from_xyz(directions[i, 0], directions[i, 1], directions[i, 2])
         out[i, 0] = u
@@ -57,7 +57,12 @@ def _squares(directions, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _taps(directions, side, nodes, weights):  # type: ignore[no-untyped-def]
+def _taps(
+    directions: NDArray[np.floating],
+    side: int,
+    nodes: NDArray[np.int32],
+    weights: NDArray[np.float32],
+) -> None:
     for i in range(directions.shape[0]):
         u, v = square_from_xyz(directions[i, 0], directions[i, 1], directions[i, 2])
         column, s = first_tap(u, side)
