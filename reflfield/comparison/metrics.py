@@ -1,0 +1,464 @@
+"""How close relit pictures are to photographs, in the units of the literature.
+
+All measures are taken over *object pixels*: pixels whose silhouette coverage is
+at least one half, eroded by two pixels, so that neither the backdrop nor the
+anti-aliased rim counts. One exposure serves all frames of a comparison,
+
+    e = 1 / (99.5th percentile of the photographs' luminance over the object
+             pixels of all frames),
+
+and nothing is rescaled per picture or per channel: the lights are known.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_erosion
+
+from reflfield.comparison.tonemapping import display, luminance
+from reflfield.errors import InputError, ShapeError
+
+with warnings.catch_warnings():
+    # The package still imports a distutils-era helper on some Pythons.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import flip_evaluator
+    from skimage.metrics import structural_similarity
+
+Image = NDArray[np.float64]
+
+COVERAGE_OF_OBJECT = 0.5
+EROSION_PX = 2
+EXPOSURE_PERCENTILE = 99.5
+# A 0.7 m wide screen of 3840 pixels seen from 0.7 m, FLIP's own default.
+PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
+# Equal pictures have no error and an infinite PSNR, which JSON cannot hold and
+# no mean survives. 100 dB is an error of 1e-5 of the peak, below half floats.
+PSNR_CAP_DB = 100.0
+# skimage's default window; smaller only for pictures that it does not fit into.
+SSIM_WINDOW_PX = 7
+
+DEFINITIONS: Mapping[str, str] = {
+    "object_pixels": "silhouette coverage >= 0.5, eroded by a disk of radius 2 pixels",
+    "exposure": "1 / 99.5th percentile of the photographs' luminance over all object pixels",
+    "psnr_ldr": "on sRGB(clip(exposure * x, 0, 1)), peak 1, dB, capped",
+    "psnr_hdr": "on exposure * x, peak 1, dB, capped",
+    "ssim": "scikit-image, uniform 7 x 7 window, on the LDR pictures, map averaged",
+    "flip": "LDR-FLIP, map averaged; 0 is equal, 1 is the worst",
+    "backdrop": "black in both pictures where coverage < 0.5, so windows do not see it",
+    "colour_ratio": "sum of relit / sum of photograph over object pixels, per channel",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """A photograph and the picture rendered for the same camera and light.
+
+    Attributes
+    ----------
+    name : str
+        Frame name, quoted in results and errors.
+    photograph, relit : (h, w, 3) float
+        Linear radiance.
+    silhouette : (h, w) float
+        Coverage by the object, 0 to 1.
+    """
+
+    name: str
+    photograph: NDArray[Any]
+    relit: NDArray[Any]
+    silhouette: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class FrameMetrics:
+    """Measures of one frame; see `DEFINITIONS`.
+
+    Attributes
+    ----------
+    psnr_ldr, psnr_hdr : float
+        dB, at most `PSNR_CAP_DB`.
+    ssim, flip : float
+    n_pixels : int
+        Object pixels measured.
+    colour_ratio : tuple of three float or None
+        Relit over photograph per channel; None where the photograph is black.
+    """
+
+    name: str
+    psnr_ldr: float
+    psnr_hdr: float
+    ssim: float
+    flip: float
+    n_pixels: int
+    colour_ratio: tuple[float | None, float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Measures of all frames, their mean, and how they were taken.
+
+    Attributes
+    ----------
+    frames : tuple of FrameMetrics
+    exposure : float
+        The factor e that all pictures were multiplied with.
+    warnings : tuple of str
+        What a reader of the numbers should know.
+    """
+
+    frames: tuple[FrameMetrics, ...]
+    exposure: float
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Plain mean over frames of every measure."""
+        keys = ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels")
+        return {k: float(np.mean([getattr(f, k) for f in self.frames])) for k in keys}
+
+    @property
+    def colour_ratio(self) -> tuple[float | None, ...]:
+        """Mean over frames of the ratio relit / photograph, per channel."""
+        columns = zip(*(f.colour_ratio for f in self.frames), strict=True)
+        kept = [[r for r in column if r is not None] for column in columns]
+        return tuple(float(np.mean(column)) if column else None for column in kept)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``metrics.json``; see `to_json`."""
+        keys = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels")
+        return {
+            "frames": [{key: getattr(f, key) for key in keys} for f in self.frames],
+            "mean": self.mean,
+            "extra": {
+                "exposure": self.exposure,
+                "pixels_per_degree": PIXELS_PER_DEGREE,
+                "psnr_cap_db": PSNR_CAP_DB,
+                "colour_ratio": list(self.colour_ratio),
+                "frames": [
+                    {"name": f.name, "colour_ratio": list(f.colour_ratio)} for f in self.frames
+                ],
+                "definitions": dict(DEFINITIONS),
+                "warnings": list(self.warnings),
+            },
+        }
+
+    def to_json(self) -> str:
+        """``metrics.json``: frames, mean, and under "extra" what else was found."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+
+def object_pixels(silhouette: ArrayLike) -> NDArray[np.bool_]:
+    """Pixels that count: coverage >= 0.5, eroded by a disk of radius 2 pixels.
+
+    Beyond the border of the picture nothing is known to be object, so the two
+    outermost pixels never count.
+
+    Parameters
+    ----------
+    silhouette : (h, w) array_like
+        Coverage, 0 to 1.
+
+    Returns
+    -------
+    (h, w) bool
+        True where the pixel counts.
+
+    Examples
+    --------
+    >>> object_pixels(np.ones((7, 6))).sum(axis=1).tolist()
+    [0, 0, 2, 2, 2, 0, 0]
+    """
+    covered = np.asarray(silhouette) >= COVERAGE_OF_OBJECT
+    # Two rounds of the 4-neighbour cross remove exactly the disk of radius 2.
+    return binary_erosion(covered, iterations=EROSION_PX)
+
+
+def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
+    """Exposure e of a whole comparison; one pass over the photographs.
+
+    Parameters
+    ----------
+    pictures : iterable of ((h, w, 3), (h, w))
+        Photograph (linear) and silhouette of every frame.
+
+    Returns
+    -------
+    float
+        Exposure; ``nan`` if the percentile is not positive (photographs are
+        black), because then no exposure is defined.
+
+    Raises
+    ------
+    InputError
+        If no frame has an object pixel.
+
+    Notes
+    -----
+    Exact: keeps the luminance of all object pixels, eight bytes each.
+
+    Examples
+    --------
+    >>> grey = np.full((9, 9, 3), 0.25)
+    >>> round(common_exposure([(grey, np.ones((9, 9)))]), 6)
+    4.0
+    """
+    kept = [
+        luminance(np.asarray(photograph)[object_pixels(silhouette)])
+        for photograph, silhouette in pictures
+    ]
+    values = np.concatenate(kept) if kept else np.zeros(0)
+    if values.size == 0:
+        raise InputError(
+            "frames: expected at least one object pixel to set the exposure from, received "
+            f"none in {len(kept)} frames; check the silhouettes"
+        )
+    white = float(np.percentile(values, EXPOSURE_PERCENTILE))
+    return 1.0 / white if white > 0.0 else math.nan
+
+
+def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -> Comparison:
+    """Measure relit pictures against photographs, all at one exposure.
+
+    Parameters
+    ----------
+    frames : iterable of FramePair
+        Read twice (exposure, then measures). A one-shot iterator is kept in
+        memory; pass an object that can be iterated again, or `exposure`, to
+        hold one frame at a time.
+    exposure : float, optional
+        Exposure from `common_exposure`, if known already.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If there is no frame, or a frame has no object pixel, or a value under
+        one is not finite. The message names the frame.
+    ShapeError
+        If photograph, relit picture and silhouette differ in size.
+
+    Examples
+    --------
+    White photographs, relit 10 % too dark: HDR error 0.1, so 20 dB.
+
+    >>> white = np.ones((16, 16, 3))
+    >>> result = compare_frames([FramePair("a", white, 0.9 * white, np.ones((16, 16)))])
+    >>> round(result.mean["psnr_hdr"], 9), result.frames[0].n_pixels
+    (20.0, 144)
+    """
+    pairs = list(frames) if isinstance(frames, Iterator) else frames
+    if exposure is None:
+        exposure = common_exposure((p.photograph, p.silhouette) for p in _checked(pairs))
+    notes: tuple[str, ...] = ()
+    if math.isnan(exposure):
+        exposure = 1.0
+        notes = ("The photographs are black over the object; exposure 1 was used.",)
+    measured = tuple(measure_frame(pair, exposure) for pair in pairs)
+    if not measured:
+        raise InputError("frames: expected at least one frame to compare, received none")
+    return Comparison(measured, exposure, notes)
+
+
+def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
+    """Measures of one frame at a given exposure.
+
+    Parameters
+    ----------
+    pair : FramePair
+    exposure : float
+        From `common_exposure`.
+
+    Returns
+    -------
+    FrameMetrics
+
+    Raises
+    ------
+    InputError
+        If the frame has no object pixel or a value under one is not finite.
+    ShapeError
+        If the pictures differ in size.
+    """
+    check_pair(pair)
+    counted = object_pixels(pair.silhouette)
+    photograph, relit = without_backdrop(pair)
+    shown_photograph, shown_relit = display(photograph, exposure), display(relit, exposure)
+    return FrameMetrics(
+        name=pair.name,
+        psnr_ldr=psnr(shown_photograph[counted], shown_relit[counted]),
+        psnr_hdr=psnr(exposure * photograph[counted], exposure * relit[counted]),
+        ssim=float(ssim_map(shown_photograph, shown_relit)[counted].mean()),
+        flip=float(flip_map(shown_photograph, shown_relit)[counted].mean(dtype=np.float64)),
+        n_pixels=int(counted.sum()),
+        colour_ratio=_colour_ratio(photograph[counted], relit[counted]),
+    )
+
+
+def check_pair(pair: FramePair) -> None:
+    """Demand equal sizes, at least one object pixel and finite values.
+
+    Raises
+    ------
+    ShapeError
+        If photograph, relit picture and silhouette differ in size.
+    InputError
+        If there is no object pixel, or a value where coverage >= 0.5 is not
+        finite. Values elsewhere are never read and may be anything.
+    """
+    size = np.shape(pair.silhouette)
+    for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
+        if len(size) != 2 or np.shape(image) != (*size, 3):
+            raise ShapeError(
+                f"frame {pair.name!r}, {what}: expected shape (h, w, 3) with the size of the "
+                f"silhouette, received {np.shape(image)} and silhouette {size}"
+            )
+    if not object_pixels(pair.silhouette).any():
+        raise InputError(
+            f"frame {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, eroded "
+            "by 2 pixels), received none; leave the frame out or check its silhouette"
+        )
+    covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
+    for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
+        _check_finite(pair.name, what, image, covered)
+
+
+def without_backdrop(pair: FramePair) -> tuple[Image, Image]:
+    """Photograph and relit picture as float64, black where coverage < 0.5.
+
+    SSIM and FLIP look at neighbourhoods; a backdrop that the field cannot know
+    must not enter them from outside the silhouette.
+    """
+    covered = (np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT)[..., None]
+    photograph, relit = (
+        np.where(covered, np.asarray(image, dtype=np.float64), 0.0)
+        for image in (pair.photograph, pair.relit)
+    )
+    return photograph, relit
+
+
+def psnr(reference: ArrayLike, test: ArrayLike) -> float:
+    r"""Peak signal-to-noise ratio for peak 1, :math:`-10 \log_{10} \mathrm{MSE}`, dB.
+
+    At most `PSNR_CAP_DB`, which equal pictures get.
+
+    Examples
+    --------
+    >>> psnr([0.5, 0.5], [0.6, 0.4])
+    20.0
+    >>> psnr([0.5], [0.5])
+    100.0
+    """
+    difference = np.asarray(test, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
+    mean_square = float(np.mean(difference**2))
+    if mean_square <= 10.0 ** (-PSNR_CAP_DB / 10.0):
+        return PSNR_CAP_DB
+    return -10.0 * math.log10(mean_square)
+
+
+def ssim_map(reference: Image, test: Image) -> Image:
+    """Structural similarity around each pixel, mean over channels.
+
+    Parameters
+    ----------
+    reference, test : (h, w, 3) float64
+        Displayed values in [0, 1].
+
+    Returns
+    -------
+    (h, w) float64
+        1 where equal.
+
+    References
+    ----------
+    .. [1] Z. Wang, A. Bovik, H. Sheikh, E. Simoncelli, "Image quality
+       assessment: from error visibility to structural similarity", IEEE
+       Transactions on Image Processing 13(4), 2004.
+    """
+    # At least 5: smaller pictures have no object pixels.
+    fitting = min(SSIM_WINDOW_PX, *reference.shape[:2])
+    window = fitting if fitting % 2 else fitting - 1
+    _, similarity = structural_similarity(
+        reference, test, win_size=window, data_range=1.0, channel_axis=-1, full=True
+    )
+    return np.asarray(similarity, dtype=np.float64).mean(axis=-1)
+
+
+def flip_map(reference: Image, test: Image) -> NDArray[np.float32]:
+    """LDR-FLIP error of each pixel, at `PIXELS_PER_DEGREE`.
+
+    Parameters
+    ----------
+    reference, test : (h, w, 3) float64
+        Displayed (sRGB encoded) values in [0, 1].
+
+    Returns
+    -------
+    (h, w) float32
+        0 (not distinguishable) to 1.
+
+    References
+    ----------
+    .. [1] P. Andersson et al., "FLIP: A Difference Evaluator for Alternating
+       Images", Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020.
+    """
+    error, _, _ = flip_evaluator.evaluate(
+        np.ascontiguousarray(reference, dtype=np.float32),
+        np.ascontiguousarray(test, dtype=np.float32),
+        "LDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"ppd": PIXELS_PER_DEGREE},
+    )
+    return np.asarray(error, dtype=np.float32)[..., 0]
+
+
+def _checked(pairs: Iterable[FramePair]) -> Iterator[FramePair]:
+    for pair in pairs:
+        check_pair(pair)
+        yield pair
+
+
+def _check_finite(
+    name: str, what: str, image: NDArray[Any], covered: NDArray[np.bool_]
+) -> None:
+    bad = covered & ~np.isfinite(image).all(axis=-1)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise InputError(
+            f"frame {name!r}, {what}: expected finite radiance on the object, received "
+            f"{np.asarray(image)[row, column].tolist()} at row {row}, column {column} "
+            f"({int(bad.sum())} such pixels); repair the picture or leave the frame out"
+        )
+
+
+def _colour_ratio(
+    photograph: Image, relit: Image
+) -> tuple[float | None, float | None, float | None]:
+    sums = photograph.sum(axis=0), relit.sum(axis=0)
+    red, green, blue = (
+        float(got / want) if want > 0.0 else None for want, got in zip(*sums, strict=True)
+    )
+    return red, green, blue
+
+
+def worst_to_best(frames: Sequence[FrameMetrics]) -> list[FrameMetrics]:
+    """Frames by falling FLIP error, ties by name.
+
+    Examples
+    --------
+    >>> make = lambda name, flip: FrameMetrics(name, 30, 30, 0.9, flip, 9, (1, 1, 1))
+    >>> [f.name for f in worst_to_best([make("a", 0.1), make("b", 0.3)])]
+    ['b', 'a']
+    """
+    return sorted(frames, key=lambda f: (-f.flip, f.name))
