@@ -1,0 +1,233 @@
+"""Lights: where they stand and how much they give.
+
+Directions point from the surface to the light. What a light gives is stated as the
+irradiance of a surface that faces it, so that an apparent BRDF sample is radiance divided
+by this number and the cosine stays in the data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.checks import check_shape
+from reflfield.errors import CaptureError, InputError
+
+Array = NDArray[np.float64]
+
+POINT = "point"
+DIRECTIONAL = "directional"
+SPOT = "spot"
+ENVIRONMENT = "environment"
+UNKNOWN = "unknown"
+KINDS = (POINT, DIRECTIONAL, SPOT, ENVIRONMENT, UNKNOWN)
+
+# Orientation of latitude-longitude maps, as the programs that write them name it.
+CONVENTIONS = ("openexr", "mitsuba", "blender")
+
+# Two lights closer than this would be one light; it also keeps 1/d^2 finite.
+SMALLEST_DISTANCE = 1e-9
+
+
+def _zeros() -> Array:
+    return np.zeros(3)
+
+
+def _ones() -> Array:
+    return np.ones(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """One lighting condition: a single light, an environment map, or one nobody measured.
+
+    Parameters
+    ----------
+    id : str
+        Unique name within the capture.
+    kind : {"point", "directional", "spot", "environment", "unknown"}
+        ``unknown`` is a constant lighting that was not measured: one condition, whose
+        irradiance counts as 1 everywhere.
+    position : (3,) array_like
+        World position, metres (point, spot).
+    direction : (3,) array_like
+        Towards the light (directional) or along the beam (spot); normalised here.
+    intensity : (3,) array_like
+        Radiant intensity, W/sr per channel (point, spot), or irradiance of a facing
+        surface, W/m^2 per channel (directional).
+    exponent : float
+        Spot: intensity falls like ``cos(angle to the beam) ** exponent``.
+    cone_angle, falloff_angle : float
+        Spot: half angles, radians; full intensity inside `falloff_angle`, none outside
+        `cone_angle`, a smooth step between (as in pbrt's spotlight).
+    file : Path, optional
+        Environment: the map.
+    convention : {"openexr", "mitsuba", "blender"}
+        Environment: how the map's pixels turn into directions.
+    world_from_environment : (3, 3) array_like
+        Environment: rotation from the map's frame to the world.
+
+    Raises
+    ------
+    CaptureError
+        If a number is not finite, an intensity negative, a direction zero.
+
+    Examples
+    --------
+    Eight watts per steradian, two metres above the origin, give 2 W/m^2:
+
+    >>> lamp = Light("l0", "point", position=[0, 0, 2], intensity=[8, 8, 8])
+    >>> lamp.irradiance([[0, 0, 0]])
+    array([[2., 2., 2.]])
+    >>> lamp.directions([[0, 0, 0]])
+    array([[0., 0., 1.]])
+    """
+
+    id: str
+    kind: str
+    position: Array = field(default_factory=_zeros)
+    direction: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    intensity: Array = field(default_factory=_ones)
+    exponent: float = 0.0
+    cone_angle: float = float(np.pi)
+    falloff_angle: float = float(np.pi)
+    file: Path | None = None
+    convention: str = "openexr"
+    world_from_environment: Array = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise CaptureError(
+                f"light {self.id!r}: expected type {', '.join(KINDS)}, received {self.kind!r}"
+            )
+        for name in ("position", "direction", "intensity"):
+            object.__setattr__(self, name, _vector(self, name))
+        object.__setattr__(self, "direction", _unit(self))
+        if (self.intensity < 0).any():
+            raise CaptureError(
+                f"light {self.id!r}: intensity: expected values >= 0, "
+                f"received {self.intensity.tolist()}"
+            )
+        _check_spot(self)
+        if self.kind == ENVIRONMENT:
+            _check_environment(self)
+
+    @property
+    def known(self) -> bool:
+        """Whether the light's direction was measured."""
+        return self.kind != UNKNOWN
+
+    def directions(self, points: ArrayLike) -> Array:
+        """Unit directions (n, 3) from world points (n, 3) to the light.
+
+        An unknown light answers +Z of the world everywhere: one constant condition.
+
+        Raises
+        ------
+        InputError
+            For an environment, which has no single direction.
+        """
+        world = self._points(points)
+        if self.kind in (POINT, SPOT):
+            towards = self.position - world
+            return towards / self._distances(world)[:, None]
+        towards = np.array([0.0, 0.0, 1.0]) if self.kind == UNKNOWN else self.direction
+        return np.tile(towards, (len(world), 1))
+
+    def distances(self, points: ArrayLike) -> Array:
+        """Distances (n,) from world points (n, 3), metres; inf for far lights."""
+        world = self._points(points)
+        if self.kind in (POINT, SPOT):
+            return self._distances(world)
+        return np.full(len(world), np.inf)
+
+    def irradiance(self, points: ArrayLike) -> Array:
+        r"""Irradiance (n, 3) of surfaces at world points (n, 3) that face the light.
+
+        :math:`E = I\,s(\theta) / d^2` for point and spot lights (`s` is the spot's falloff),
+        the given irradiance for directional ones, 1 for an unknown light. W/m^2.
+        """
+        world = self._points(points)
+        if self.kind == UNKNOWN:
+            return np.ones((len(world), 3))
+        if self.kind == DIRECTIONAL:
+            return np.tile(self.intensity, (len(world), 1))
+        falloff = self._falloff(world) / self._distances(world) ** 2
+        return falloff[:, None] * self.intensity
+
+    def _points(self, points: ArrayLike) -> Array:
+        if self.kind == ENVIRONMENT:
+            raise InputError(
+                f"light {self.id!r}: an environment has no single direction or irradiance; "
+                "integrate over its map"
+            )
+        world = np.asarray(points, dtype=np.float64)
+        check_shape("points", world, (None, 3))
+        return world
+
+    def _distances(self, world: Array) -> Array:
+        return np.maximum(np.linalg.norm(self.position - world, axis=1), SMALLEST_DISTANCE)
+
+    def _falloff(self, world: Array) -> Array:
+        """Fraction (n,) of the spot's intensity that goes towards each point."""
+        if self.kind != SPOT:
+            return np.ones(len(world))
+        cosine = (world - self.position) @ self.direction / self._distances(world)
+        inner, outer = np.cos(self.falloff_angle), np.cos(self.cone_angle)
+        step = np.clip((cosine - outer) / max(inner - outer, 1e-12), 0.0, 1.0)
+        smooth = step * step * (3 - 2 * step) * (cosine >= outer)
+        if self.exponent == 0:
+            return smooth
+        return smooth * np.maximum(cosine, 0.0) ** self.exponent
+
+
+def _vector(light: Light, name: str) -> Array:
+    vector = np.array(getattr(light, name), dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise CaptureError(
+            f"light {light.id!r}: {name}: expected 3 finite numbers, received {vector.tolist()}"
+        )
+    vector.setflags(write=False)
+    return vector
+
+
+def _unit(light: Light) -> Array:
+    length = np.linalg.norm(light.direction)
+    if length < 1e-4:  # the limit of the .lp readers in use
+        raise CaptureError(
+            f"light {light.id!r}: direction: expected a vector that is not zero, "
+            f"received {light.direction.tolist()}"
+        )
+    unit = light.direction / length
+    unit.setflags(write=False)
+    return unit
+
+
+def _check_spot(light: Light) -> None:
+    ordered = 0 <= light.falloff_angle <= light.cone_angle <= np.pi
+    if not (ordered and np.isfinite(light.exponent) and light.exponent >= 0):
+        raise CaptureError(
+            f"light {light.id!r}: expected 0 <= falloff_angle <= cone_angle <= pi radians and "
+            f"exponent >= 0, received {light.falloff_angle}, {light.cone_angle}, "
+            f"{light.exponent}"
+        )
+
+
+def _check_environment(light: Light) -> None:
+    if light.file is None:
+        raise CaptureError(f"light {light.id!r}: an environment needs the file of its map")
+    if light.convention not in CONVENTIONS:
+        raise CaptureError(
+            f"light {light.id!r}: convention: expected {', '.join(CONVENTIONS)}, "
+            f"received {light.convention!r}"
+        )
+    rotation = np.array(light.world_from_environment, dtype=np.float64)
+    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+        raise CaptureError(
+            f"light {light.id!r}: world_from_environment: expected a 3x3 rotation, "
+            f"received {rotation.tolist()}"
+        )
+    object.__setattr__(light, "world_from_environment", rotation)

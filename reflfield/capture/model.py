@@ -1,0 +1,372 @@
+"""A capture: which camera photographed the object under which light, and the files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.capture.cameras import Camera
+from reflfield.capture.images import (
+    image_size,
+    merge_exposures,
+    read_coverage,
+    read_encoded,
+    read_image,
+)
+from reflfield.capture.lights import UNKNOWN, Light
+from reflfield.capture.silhouettes import silhouette_from_photographs
+from reflfield.errors import CaptureError
+
+HULL = "hull"
+PLANE = "plane"
+DIGEST_PARTS = ("cameras", "lights", "silhouettes", "photographs")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One file of a photograph; `seconds` is given where exposures are bracketed."""
+
+    path: Path
+    seconds: float = 1.0
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What one camera saw under one light.
+
+    Parameters
+    ----------
+    name : str
+        File stem; names of relit frames are taken from it.
+    camera, light : int
+        Indices into the capture's cameras and lights.
+    exposures : tuple of Exposure
+        One file, or several bracketed ones.
+    """
+
+    name: str
+    camera: int
+    light: int
+    exposures: tuple[Exposure, ...]
+
+    @property
+    def path(self) -> Path:
+        """The first file."""
+        return self.exposures[0].path
+
+    def read(self) -> NDArray[np.float32]:
+        """Linear radiance, (h, w, 3) float32; bracketed exposures are merged."""
+        if len(self.exposures) == 1:
+            return read_image(self.path) / np.float32(self.exposures[0].seconds)
+        images = [read_encoded(e.path)[..., :3] for e in self.exposures]
+        return merge_exposures(images, [e.seconds for e in self.exposures])
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Photographs of one object with the cameras and lights they were taken with.
+
+    Parameters
+    ----------
+    name : str
+        Shown in reports.
+    root : Path
+        Folder of the description file; every file lies inside it.
+    cameras, lights : tuple
+        What the photographs' indices refer to.
+    photographs : tuple of Photograph
+        At most one per pair of camera and light in a capture; frames to relight may repeat.
+    base_geometry : {"hull", "plane"}
+        Whether the base surface comes from silhouettes or is the image plane of one view.
+    silhouettes : tuple of Path or None, optional
+        One per camera; None where it is to be made from the photographs.
+    up : (3,) array_like, optional
+        World direction that is up for previews.
+    format : str
+        Name of the reader.
+    description : Path, optional
+        The file that was read.
+
+    Raises
+    ------
+    CaptureError
+        If ids or (camera, light) pairs repeat, or an index is out of range.
+    """
+
+    name: str
+    root: Path
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    photographs: tuple[Photograph, ...]
+    base_geometry: str = HULL
+    silhouettes: tuple[Path | None, ...] = ()
+    up: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    format: str = "native"
+    description: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not self.silhouettes:
+            object.__setattr__(self, "silhouettes", (None,) * len(self.cameras))
+        if self.base_geometry not in (HULL, PLANE):
+            raise CaptureError(
+                f"{self.name}: base_geometry: expected 'hull' or 'plane', "
+                f"received {self.base_geometry!r}"
+            )
+        _check_unique("camera", [c.id for c in self.cameras])
+        _check_unique("light", [light.id for light in self.lights])
+        for photograph in self.photographs:
+            _check_indices(photograph, self.n_views, self.n_lights)
+
+    @property
+    def n_views(self) -> int:
+        """Number of cameras."""
+        return len(self.cameras)
+
+    @property
+    def n_lights(self) -> int:
+        """Number of lighting conditions."""
+        return len(self.lights)
+
+    @property
+    def lights_known(self) -> bool:
+        """Whether the direction of every light was measured."""
+        return all(light.kind != UNKNOWN for light in self.lights)
+
+    @cached_property
+    def photograph_index(self) -> NDArray[np.int64]:
+        """(n_views, n_lights) index into `photographs`, -1 where there is none.
+
+        Of several photographs of one pair (frames), the first.
+        """
+        index = np.full((self.n_views, self.n_lights), -1, dtype=np.int64)
+        for i in reversed(range(len(self.photographs))):
+            photograph = self.photographs[i]
+            index[photograph.camera, photograph.light] = i
+        return index
+
+    def read_photograph(self, index: int) -> NDArray[np.float32]:
+        """Linear radiance of photograph `index`, (h, w, 3) float32.
+
+        Raises
+        ------
+        CaptureError
+            If a file is missing, damaged, not finite, or not of its camera's size.
+        """
+        photograph = self.photographs[index]
+        image = photograph.read()
+        camera = self.cameras[photograph.camera]
+        _check_matches(photograph.path, camera, image.shape[1], image.shape[0])
+        return image
+
+    def read_silhouette(self, view: int) -> NDArray[np.float32]:
+        """Coverage of view `view` in [0, 1], (h, w) float32.
+
+        Read where a file is given, the whole image where the base geometry is the image
+        plane, else made from the view's photographs (`capture.silhouettes`).
+
+        Raises
+        ------
+        CaptureError
+            If the file cannot be used, or no object is found.
+        """
+        camera, path = self.cameras[view], self.silhouettes[view]
+        if path is None and self.base_geometry == PLANE:
+            return np.ones((camera.height, camera.width), dtype=np.float32)
+        if path is None:
+            return _made_silhouette(self, view)
+        coverage = read_coverage(path)
+        _check_matches(path, camera, coverage.shape[1], coverage.shape[0])
+        if not (coverage > 0.5).any():
+            raise CaptureError(
+                f"{path}: empty silhouette: no pixel of view {camera.id!r} is covered; "
+                "white must mean object"
+            )
+        return coverage
+
+    def subset(
+        self, views: ArrayLike | None = None, lights: ArrayLike | None = None
+    ) -> Capture:
+        """The capture of some views and lights, in the order given.
+
+        Parameters
+        ----------
+        views, lights : (n,) array_like of int, optional
+            Indices to keep; None keeps all. Photographs of others are dropped.
+        """
+        keep_views = _indices("views", views, self.n_views)
+        keep_lights = _indices("lights", lights, self.n_lights)
+        new_view = {old: new for new, old in enumerate(keep_views)}
+        new_light = {old: new for new, old in enumerate(keep_lights)}
+        kept = tuple(
+            replace(p, camera=new_view[p.camera], light=new_light[p.light])
+            for p in self.photographs
+            if p.camera in new_view and p.light in new_light
+        )
+        return replace(
+            self,
+            cameras=tuple(self.cameras[i] for i in keep_views),
+            lights=tuple(self.lights[i] for i in keep_lights),
+            silhouettes=tuple(self.silhouettes[i] for i in keep_views),
+            photographs=kept,
+        )
+
+    def digest(self, parts: Iterable[str] = DIGEST_PARTS) -> str:
+        """SHA-256 of what the capture says and what its files hold.
+
+        Parameters
+        ----------
+        parts : iterable of {"cameras", "lights", "silhouettes", "photographs"}
+            What to include. Where no silhouette file is given, the photographs it is made
+            from stand in for it.
+
+        Returns
+        -------
+        str
+            64 hexadecimal digits; times and folder names do not enter.
+        """
+        wanted = tuple(parts)
+        unknown = set(wanted) - set(DIGEST_PARTS)
+        if unknown:
+            raise CaptureError(f"digest: expected parts {DIGEST_PARTS}, received {unknown}")
+        total = hashlib.sha256(f"{self.base_geometry} {self.up.tolist()}".encode())
+        for part in DIGEST_PARTS:
+            if part in wanted:
+                total.update(part.encode())
+                for piece in self._described(part):
+                    total.update(piece)
+        return total.hexdigest()
+
+    def _described(self, part: str) -> Iterator[bytes]:
+        """Bytes that stand for one part of the capture."""
+        if part == "cameras":
+            yield from (_camera_text(c).encode() for c in self.cameras)
+        elif part == "lights":
+            yield from (_light_text(light).encode() for light in self.lights)
+            yield from (_file_digest(light.file) for light in self.lights if light.file)
+        elif part == "silhouettes":
+            for view, path in enumerate(self.silhouettes):
+                files = [path] if path is not None else self._silhouette_sources(view)
+                yield from (_file_digest(p) for p in files)
+        else:
+            for photograph in self.photographs:
+                yield f"{photograph.name} {photograph.camera} {photograph.light}".encode()
+                for exposure in photograph.exposures:
+                    yield str(exposure.seconds).encode() + _file_digest(exposure.path)
+
+    def _silhouette_sources(self, view: int) -> list[Path]:
+        if self.base_geometry == PLANE:
+            return []
+        return [e.path for p in self.photographs if p.camera == view for e in p.exposures]
+
+
+def check_photographs(capture: Capture) -> None:
+    """Demand that every photograph exists and has its camera's size (headers only).
+
+    Raises
+    ------
+    CaptureError
+        Naming the first missing or mismatched file and how many there are.
+    """
+    missing = [e.path for p in capture.photographs for e in p.exposures if not e.path.is_file()]
+    if missing:
+        total = sum(len(p.exposures) for p in capture.photographs)
+        raise CaptureError(
+            f"{missing[0]}: photograph missing ({len(missing)} of {total} files are); "
+            "copy them or remove them from the description"
+        )
+    for photograph in capture.photographs:
+        camera = capture.cameras[photograph.camera]
+        for exposure in photograph.exposures:
+            _check_matches(exposure.path, camera, *image_size(exposure.path))
+
+
+def check_pairs(capture: Capture) -> None:
+    """Demand at most one photograph per camera and light.
+
+    Raises
+    ------
+    CaptureError
+        Naming the first pair that repeats.
+    """
+    seen: dict[tuple[int, int], str] = {}
+    for photograph in capture.photographs:
+        pair = (photograph.camera, photograph.light)
+        if pair in seen:
+            raise CaptureError(
+                f"duplicate photograph of camera {capture.cameras[pair[0]].id!r} under light "
+                f"{capture.lights[pair[1]].id!r}: {seen[pair]!r} and {photograph.name!r}; "
+                "keep one of them"
+            )
+        seen[pair] = photograph.name
+
+
+def _made_silhouette(capture: Capture, view: int) -> NDArray[np.float32]:
+    photographs = (p for p in capture.photographs if p.camera == view)
+    return silhouette_from_photographs(
+        (p.read() for p in photographs), name=f"view {capture.cameras[view].id!r}"
+    )
+
+
+def _check_indices(photograph: Photograph, n_views: int, n_lights: int) -> None:
+    inside = 0 <= photograph.camera < n_views and 0 <= photograph.light < n_lights
+    if not inside:
+        raise CaptureError(
+            f"photograph {photograph.name!r}: expected camera < {n_views} and "
+            f"light < {n_lights}, received {photograph.camera} and {photograph.light}"
+        )
+
+
+def _check_unique(what: str, ids: Sequence[str]) -> None:
+    seen: set[str] = set()
+    for id_ in ids:
+        if id_ in seen:
+            raise CaptureError(f"duplicate {what} id {id_!r}; ids must be unique")
+        seen.add(id_)
+
+
+def _check_matches(path: Path, camera: Camera, width: int, height: int) -> None:
+    if (width, height) != (camera.width, camera.height):
+        raise CaptureError(
+            f"{path}: image size: expected {camera.width} x {camera.height} pixels as camera "
+            f"{camera.id!r} says, received {width} x {height}"
+        )
+
+
+def _indices(name: str, indices: ArrayLike | None, count: int) -> list[int]:
+    if indices is None:
+        return list(range(count))
+    array = np.atleast_1d(np.asarray(indices))
+    if array.dtype == bool:
+        array = np.flatnonzero(array)
+    if array.size and not (array.min() >= 0 and array.max() < count):
+        raise CaptureError(f"{name}: expected indices in 0 .. {count - 1}, received {array}")
+    return [int(i) for i in array]
+
+
+def _camera_text(camera: Camera) -> str:
+    numbers: list[Any] = [camera.width, camera.height, camera.fl_x, camera.fl_y]
+    numbers += [camera.cx, camera.cy, camera.distortion, camera.camera_from_world.tolist()]
+    return f"{camera.id} {camera.kind} {numbers}"
+
+
+def _light_text(light: Light) -> str:
+    numbers: list[Any] = [light.position.tolist(), light.direction.tolist()]
+    numbers += [light.intensity.tolist(), light.exponent, light.cone_angle, light.falloff_angle]
+    numbers += [light.convention, light.world_from_environment.tolist()]
+    return f"{light.id} {light.kind} {numbers}"
+
+
+def _file_digest(path: Path) -> bytes:
+    """SHA-256 of a file; the bytes are streamed."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").digest()
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from error
