@@ -190,7 +190,7 @@ def test_black_photographs_are_measured_with_a_warning():
 @pytest.mark.stability
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_huge_radiance_stays_finite(dtype, rng):
-    top = np.finfo(dtype).max / 4
+    top = float(np.finfo(dtype).max) / 4
     photograph = rng.uniform(0, 1, (16, 16, 3)).astype(dtype)
     photograph[8, 8] = 1
     photograph *= dtype(min(top, 1e100))
