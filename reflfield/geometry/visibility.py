@@ -1,0 +1,470 @@
+"""What each texel sees: occlusion towards cameras and lights by ray tracing.
+
+Near cameras and near lights are points: every texel has its own ray to them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from reflfield.capture.cameras import Camera
+from reflfield.capture.lights import Light
+from reflfield.checks import check_shape
+from reflfield.errors import InputError, ShapeError
+from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.texels import TexelTable
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# Lights that come from everywhere or from nowhere known: no single ray can miss them.
+_WITHOUT_DIRECTION = ("environment", "unknown")
+
+
+@dataclass(frozen=True)
+class VisibilityOptions:
+    """When a texel counts as seen and as lit.
+
+    Parameters
+    ----------
+    grazing_cosine : float
+        Views whose angle to the smooth normal has a smaller cosine are rejected: a pixel
+        there covers many texels.
+    light_cosine : float
+        Lights at or below this cosine over the smooth normal do not light the texel.
+    edge_band : float
+        Rejected distance from depth discontinuities in the photograph, pixels.
+    edge_slope : float
+        Neighbouring pixels whose depths differ by more than this many pixel footprints
+        are a discontinuity. At the grazing limit .15 a plane differs by 6.6 footprints.
+    ray_offset : float
+        Start of the rays above the surface, in diagonals of the mesh's bounding box.
+    coverage : float
+        Least coverage of a pixel by the silhouette, where one is given.
+    shadow_band : float
+        Distance from a shadow's boundary that `shadow_edge` reports, texel spacings.
+    """
+
+    grazing_cosine: float = 0.15
+    light_cosine: float = 0.0
+    edge_band: float = 1.5
+    edge_slope: float = 10.0
+    ray_offset: float = 2e-4
+    coverage: float = 0.5
+    shadow_band: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("grazing_cosine", "light_cosine", "coverage"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise InputError(
+                    f"{name}: expected a number in [0, 1), received {getattr(self, name)}"
+                )
+        for name in ("edge_band", "edge_slope", "ray_offset", "shadow_band"):
+            if not getattr(self, name) >= 0.0:
+                raise InputError(f"{name}: expected >= 0, received {getattr(self, name)}")
+
+
+class RayScene:
+    """Ray queries against a triangle mesh, in Open3D's Embree scene.
+
+    Embree works in single precision; the mesh is moved to the origin and scaled to
+    unit diagonal first, so that answers do not depend on where or how large it is.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    threads : int
+        Threads used by one query; 0 takes all. Answers do not depend on it.
+
+    Examples
+    --------
+    >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    >>> scene = RayScene(square)
+    >>> distance, face, _ = scene.first_hit([[0.6, 0.2, 3.0], [5, 5, 3]], [[0, 0, -1]] * 2)
+    >>> distance, face
+    (array([ 3., inf]), array([ 0, -1], dtype=int32))
+    """
+
+    def __init__(self, mesh: Mesh, threads: int = 0) -> None:
+        if not len(mesh.faces):
+            raise ShapeError("mesh: expected at least one triangle, received none")
+        self.mesh = mesh
+        self._threads = threads
+        self._origin = mesh.bounds.mean(axis=0)
+        self._scale = mesh.diagonal
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
+        self._scene.add_triangles(
+            open3d.core.Tensor(self._local(mesh.vertices)),
+            open3d.core.Tensor(mesh.faces.astype(np.uint32)),
+        )
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the mesh's bounding box, metres."""
+        return self._scale
+
+    def first_hit(
+        self, origins: ArrayLike, directions: ArrayLike
+    ) -> tuple[Array, NDArray[np.int32], Array]:
+        """Nearest intersection of each ray.
+
+        Parameters
+        ----------
+        origins : (n, 3) array_like
+            Metres.
+        directions : (n, 3) array_like
+            Unit vectors.
+
+        Returns
+        -------
+        distance : (n,) float64
+            Metres along the ray; inf where nothing is hit.
+        face : (n,) int32
+            Triangle; -1 where nothing is hit.
+        barycentric : (n, 3) float64
+            Weights of the triangle's corners; zero where nothing is hit.
+        """
+        rays, skipped = self._rays(origins, directions)
+        answer = self._scene.cast_rays(open3d.core.Tensor(rays), nthreads=self._threads)
+        travelled = answer["t_hit"].numpy().astype(np.float64)
+        missed = ~np.isfinite(travelled)
+        face = answer["primitive_ids"].numpy().astype(np.int64)
+        second, third = answer["primitive_uvs"].numpy().astype(np.float64).T
+        barycentric = np.stack([1.0 - second - third, second, third], axis=1)
+        barycentric[missed] = 0.0
+        distance = travelled * self._scale + skipped
+        return distance, np.where(missed, -1, face).astype(np.int32), barycentric
+
+    def occluded(
+        self, origins: ArrayLike, directions: ArrayLike, distances: ArrayLike | None = None
+    ) -> Bools:
+        """True where the mesh blocks a ray.
+
+        Parameters
+        ----------
+        origins, directions : (n, 3) array_like
+            Metres; unit vectors.
+        distances : (n,) array_like, optional
+            Length of each ray, metres; infinite by default.
+
+        Returns
+        -------
+        (n,) bool
+        """
+        rays, skipped = self._rays(origins, directions)
+        limit = np.full(len(rays), np.inf, dtype=np.float32)
+        if distances is not None:
+            reach = (np.asarray(distances, dtype=np.float64) - skipped) / self._scale
+            limit = reach.astype(np.float32)
+        lengths = np.where(limit > 0.0, limit, 0.0).astype(np.float32)
+        answer = self._rays_blocked(rays, lengths)
+        return answer & (limit > 0.0)
+
+    def inside(self, points: ArrayLike) -> Bools:
+        """True for points (n, 3) enclosed by a watertight mesh; never for an open one."""
+        array = np.asarray(points, dtype=np.float64)
+        check_shape("points", array, (None, 3))
+        if not self.mesh.watertight:
+            return np.zeros(len(array), dtype=bool)
+        # Far points lose digits in single precision and cannot be inside anyway.
+        near = ((array >= self.mesh.bounds[0]) & (array <= self.mesh.bounds[1])).all(axis=1)
+        enclosed = near.copy()
+        query = open3d.core.Tensor(self._local(array[near]))
+        # Three rays vote, so that one that grazes an edge does not decide.
+        answer = self._scene.compute_occupancy(query, nthreads=self._threads, nsamples=3)
+        enclosed[near] = answer.numpy() > 0.5
+        return enclosed
+
+    def _rays_blocked(self, rays: NDArray[np.float32], lengths: NDArray[np.float32]) -> Bools:
+        # Open3D takes one limit for all rays: the length of the direction carries ours.
+        unlimited = ~np.isfinite(lengths)
+        scaled = rays.copy()
+        scaled[:, 3:] *= np.where(unlimited, np.float32(1.0), lengths)[:, None]
+        blocked = np.zeros(len(rays), dtype=bool)
+        for rows, far in ((unlimited, np.inf), (~unlimited, 1.0)):
+            if rows.any():
+                answer = self._scene.test_occlusions(
+                    open3d.core.Tensor(scaled[rows]), 0.0, far, nthreads=self._threads
+                )
+                blocked[rows] = answer.numpy()
+        return blocked
+
+    def _local(self, points: Array) -> NDArray[np.float32]:
+        """World to scene coordinates: bounding box at the origin, diagonal 1."""
+        return ((points - self._origin) / self._scale).astype(np.float32)
+
+    def _rays(
+        self, origins: ArrayLike, directions: ArrayLike
+    ) -> tuple[NDArray[np.float32], Array]:
+        """Rays in scene coordinates, and the distance skipped at their start.
+
+        A start far from the mesh is moved up to two diagonals before its centre:
+        single precision would otherwise lose the digits of the hit.
+        """
+        start = np.asarray(origins, dtype=np.float64)
+        towards = np.asarray(directions, dtype=np.float64)
+        check_shape("origins", start, (None, 3))
+        check_shape("directions", towards, start.shape)
+        ahead = ((self._origin - start) * towards).sum(axis=1)
+        skipped = np.maximum(ahead - 2.0 * self._scale, 0.0)
+        start = start + skipped[:, None] * towards
+        return np.concatenate([self._local(start), towards.astype(np.float32)], axis=1), skipped
+
+
+def lifted_positions(texels: TexelTable, scene: RayScene, options: VisibilityOptions) -> Array:
+    """Texel positions raised off the surface by the ray offset, (n, 3) float64."""
+    lift = options.ray_offset * scene.diagonal
+    return texels.position.astype(np.float64) + lift * texels.face_normal
+
+
+def view_visibility(
+    texels: TexelTable,
+    scene: RayScene,
+    camera: Camera,
+    options: VisibilityOptions | None = None,
+    edges: Bools | None = None,
+    silhouette: NDArray[np.floating] | None = None,
+) -> Bools:
+    """Which texels a camera sees well enough to sample its photograph.
+
+    A texel is visible when it projects into the frame, is not seen at a grazing
+    angle, nothing blocks the ray to the camera, no depth discontinuity lies
+    within `edge_band` pixels of it in the photograph, and the photograph's
+    silhouette, if given, covers its pixel.
+
+    Parameters
+    ----------
+    texels : TexelTable
+    scene : RayScene
+        Of the mesh the texels lie on.
+    camera : Camera
+    options : VisibilityOptions, optional
+    edges : (height, width) bool, optional
+        Result of `depth_edges` for this camera, to share it between blocks of texels.
+    silhouette : (height, width) float, optional
+        Coverage of the object in [0, 1]; texels on pixels below `coverage` are not seen.
+        Of use where the base geometry is larger than the object, as an image plane is.
+
+    Returns
+    -------
+    (n,) bool
+
+    Raises
+    ------
+    ShapeError
+        If `edges` or `silhouette` has another size than the camera's images.
+    """
+    options = options or VisibilityOptions()
+    usable = np.ones((camera.height, camera.width), dtype=bool)
+    if silhouette is not None:
+        check_shape("silhouette", silhouette, usable.shape)
+        usable &= silhouette >= options.coverage
+    if options.edge_band > 0.0:
+        edges = depth_edges(scene, camera, options) if edges is None else edges
+        check_shape("edges", edges, usable.shape)
+        usable &= ~edges
+    visible = _faces_camera(texels, camera, options)
+    visible &= _on_usable_pixel(texels, camera, usable)
+    seen = np.flatnonzero(visible)
+    starts = lifted_positions(texels.subset(seen), scene, options)
+    visible[seen] = ~scene.occluded(
+        starts, camera.view_directions(starts), _camera_distances(camera, starts)
+    )
+    return visible
+
+
+def depth_edges(scene: RayScene, camera: Camera, options: VisibilityOptions) -> Bools:
+    """Pixels within `edge_band` of a depth discontinuity, (height, width) bool.
+
+    A discontinuity lies between two neighbouring pixels if only one of them hits
+    the surface, or their depths differ by more than `edge_slope` footprints.
+
+    Examples
+    --------
+    >>> square = Mesh([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], [[0, 2, 1], [0, 3, 2]])
+    >>> pose = np.eye(4)
+    >>> pose[2, 3] = 1.0
+    >>> camera = Camera("v", "orthographic", 6, 1, 1.0, 1.0, 0.0, 0.0, pose)
+    >>> depth_edges(RayScene(square), camera, VisibilityOptions(edge_band=1.0))
+    array([[False, False, False,  True,  True, False]])
+    """
+    depth = _depth_map(scene, camera)
+    footprint = _footprint(camera, depth)
+    across, down = _jumps(depth, footprint, options), _jumps(depth.T, footprint.T, options)
+    beside = np.zeros(depth.shape, dtype=bool)
+    beside[:, 1:] |= across
+    beside[:, :-1] |= across
+    beside[1:] |= down.T
+    beside[:-1] |= down.T
+    if not beside.any():
+        return beside
+    # The centres of the two pixels beside an edge are half a pixel away from it.
+    return np.asarray(ndimage.distance_transform_edt(~beside) + 0.5 <= options.edge_band)
+
+
+def light_visibility(
+    texels: TexelTable,
+    scene: RayScene,
+    light: Light,
+    options: VisibilityOptions | None = None,
+) -> Bools:
+    """Which texels a light reaches: above the horizon and not shadowed by the mesh.
+
+    Parameters
+    ----------
+    texels : TexelTable
+    scene : RayScene
+        Of the mesh the texels lie on.
+    light : Light
+        Environment and unknown lights reach every texel.
+    options : VisibilityOptions, optional
+
+    Returns
+    -------
+    (n,) bool
+    """
+    options = options or VisibilityOptions()
+    if light.kind in _WITHOUT_DIRECTION:
+        return np.ones(len(texels), dtype=bool)
+    lit = _faces_light(texels, light, options)
+    rows = np.flatnonzero(lit)
+    starts = lifted_positions(texels.subset(rows), scene, options)
+    lit[rows] = ~scene.occluded(starts, light.directions(starts), light.distances(starts))
+    return lit
+
+
+def shadow_edge(
+    texels: TexelTable,
+    scene: RayScene,
+    light: Light,
+    options: VisibilityOptions | None = None,
+    n_rays: int = 8,
+) -> Bools:
+    """Texels so near the boundary of a cast shadow that the geometry's error decides.
+
+    Rays start on a ring of radius `shadow_band` texel spacings around the texel, in its
+    tangent plane and a quarter of the radius above it (concave surfaces down to twice the
+    radius stay below it). The texel is on an edge where some are blocked and some not.
+    Where the surface turns away from the light no edge is reported: the cosine is zero there.
+
+    Parameters
+    ----------
+    texels, scene, light, options
+        As in `light_visibility`.
+    n_rays : int
+        Rays of the ring.
+
+    Returns
+    -------
+    (n,) bool
+    """
+    options = options or VisibilityOptions()
+    on_edge = np.zeros(len(texels), dtype=bool)
+    if light.kind in _WITHOUT_DIRECTION:
+        return on_edge
+    rows = np.flatnonzero(_faces_light(texels, light, options))
+    ring = texels.subset(rows)
+    centre = lifted_positions(ring, scene, options)
+    tangent, binormal, normal = np.moveaxis(ring.local_from_world.astype(np.float64), 1, 0)
+    radius = options.shadow_band * texels.spacing
+    n_blocked = np.zeros(len(rows), dtype=np.int64)
+    for angle in 2.0 * np.pi * np.arange(n_rays) / n_rays:
+        shift = np.cos(angle) * tangent + np.sin(angle) * binormal + 0.25 * normal
+        starts = centre + radius * shift
+        n_blocked += scene.occluded(starts, light.directions(starts), light.distances(starts))
+    on_edge[rows] = (n_blocked > 0) & (n_blocked < n_rays)
+    return on_edge
+
+
+def check_light_outside(scene: RayScene, light: Light) -> None:
+    """Refuse a light that stands inside the object.
+
+    Raises
+    ------
+    InputError
+        Naming the light.
+    """
+    if light.kind in ("point", "spot") and scene.inside(light.position[None])[0]:
+        raise InputError(
+            f"light {light.id!r}: expected a position outside the object, received "
+            f"{np.round(light.position, 4).tolist()} inside its hull; check the light's "
+            "position, its units (metres) and its frame"
+        )
+
+
+def light_inside(mesh: Mesh, position: ArrayLike) -> bool:
+    """Return True if a position (3,) lies inside a watertight mesh."""
+    return bool(RayScene(mesh).inside(np.asarray(position, dtype=np.float64)[None])[0])
+
+
+def _faces_camera(texels: TexelTable, camera: Camera, options: VisibilityOptions) -> Bools:
+    """True where the camera is in front of both the smooth and the real surface."""
+    towards = camera.view_directions(texels.position)
+    cosine = (towards * texels.normal).sum(axis=1)
+    return (cosine >= options.grazing_cosine) & ((towards * texels.face_normal).sum(axis=1) > 0)
+
+
+def _on_usable_pixel(texels: TexelTable, camera: Camera, usable: Bools) -> Bools:
+    """True where a texel projects into the frame, onto a pixel that may be sampled."""
+    pixels, depth = camera.project(texels.position)
+    in_front = (depth > 0.0) | (camera.kind == "orthographic")
+    in_frame = np.flatnonzero(in_front & _contains(camera, pixels))
+    col, row = np.floor(pixels[in_frame]).astype(np.int64).T
+    found = np.zeros(len(texels), dtype=bool)
+    found[in_frame] = usable[row, col]
+    return found
+
+
+def _contains(camera: Camera, pixels: Array) -> Bools:
+    """True inside the frame, its right and lower border excluded; False for NaN."""
+    u, v = pixels.T
+    return (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
+
+
+def _faces_light(texels: TexelTable, light: Light, options: VisibilityOptions) -> Bools:
+    cosine = (light.directions(texels.position) * texels.normal).sum(axis=1)
+    return cosine > options.light_cosine
+
+
+def _camera_distances(camera: Camera, points: Array) -> Array:
+    if camera.kind == "orthographic":
+        return np.full(len(points), np.inf)
+    return np.linalg.norm(camera.centre - points, axis=1)
+
+
+def _depth_map(scene: RayScene, camera: Camera) -> Array:
+    """Distance to the surface along the ray of each pixel centre; inf where it misses."""
+    row, col = np.mgrid[: camera.height, : camera.width]
+    centres = np.stack([col.ravel(), row.ravel()], axis=1) + 0.5
+    origins, directions = camera.rays(centres)
+    if camera.kind == "orthographic":
+        # Parallel rays have no start of their own: begin before the whole mesh.
+        ahead = (scene.mesh.bounds.mean(axis=0) - origins) @ camera.forward
+        origins = origins + np.outer(ahead - scene.diagonal, camera.forward)
+    usable = np.isfinite(directions).all(axis=1)
+    depth = np.full(len(centres), np.inf)
+    depth[usable] = scene.first_hit(origins[usable], directions[usable])[0]
+    return depth.reshape(camera.height, camera.width)
+
+
+def _footprint(camera: Camera, depth: Array) -> Array:
+    """Width of a pixel at the depth of the surface, metres."""
+    focal = min(camera.fl_x, camera.fl_y)
+    if camera.kind == "orthographic":
+        return np.full(depth.shape, 1.0 / focal)
+    return depth / focal
+
+
+def _jumps(depth: Array, footprint: Array, options: VisibilityOptions) -> Bools:
+    """True between horizontal neighbours of very different depth, (h, w - 1)."""
+    left, right = depth[:, :-1], depth[:, 1:]
+    one_misses = np.isfinite(left) != np.isfinite(right)
+    both_hit = np.isfinite(left) & np.isfinite(right)
+    step = np.abs(np.subtract(left, right, out=np.zeros_like(left), where=both_hit))
+    limit = options.edge_slope * np.minimum(footprint[:, :-1], footprint[:, 1:])
+    return one_misses | (both_hit & (step > limit))
