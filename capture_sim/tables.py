@@ -1,0 +1,151 @@
+"""Checked reading of one TOML table: each key once, nothing left over."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture_sim.errors import scene_error
+
+Table = Mapping[str, Any]
+
+
+class TableReader:
+    """Takes the keys of a table one by one and refuses unknown ones at the end.
+
+    Parameters
+    ----------
+    what : str
+        Name of the table in messages, for example ``"object (vase)"``.
+    table : mapping
+        Keys and values as TOML gives them.
+
+    Examples
+    --------
+    >>> reader = TableReader("sphere", {"radius": 0.1, "colour": "red"})
+    >>> reader.number("radius", 0.05, low=0.0)
+    0.1
+    >>> reader.finish()
+    Traceback (most recent call last):
+    ...
+    capture_sim.errors.SceneError: sphere: expected keys radius, received 'colour'; remove \
+or correct it
+    """
+
+    def __init__(self, what: str, table: Table) -> None:
+        if not isinstance(table, Mapping):
+            raise scene_error(what, "a table", table, "write key = value pairs")
+        self.what = what
+        self._left = dict(table)
+        self._known: list[str] = []
+
+    def take(self, key: str, default: Any = None) -> Any:
+        """Take the raw value of `key`, or `default`."""
+        self._known.append(key)
+        return self._left.pop(key, default)
+
+    def require(self, key: str) -> Any:
+        """Take the raw value of `key`; a `SceneError` if it is not there."""
+        value = self.take(key)
+        if value is None:
+            raise scene_error(self.name(key), "a value", "nothing", f"add {key} = ...")
+        return value
+
+    def name(self, key: str) -> str:
+        """Name of `key` in messages."""
+        return f"{self.what}.{key}"
+
+    def number(
+        self, key: str, default: float, *, low: float = -math.inf, high: float = math.inf
+    ) -> float:
+        """Take a finite number in [low, high]."""
+        return check_number(self.name(key), self.take(key, default), low=low, high=high)
+
+    def count(self, key: str, default: int, *, low: int = 1, high: int = 2**24) -> int:
+        """Take a whole number in [low, high]."""
+        value = self.take(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise scene_error(self.name(key), f"a whole number in [{low}, {high}]", value)
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        """Take true or false."""
+        value = self.take(key, default)
+        if not isinstance(value, bool):
+            raise scene_error(self.name(key), "true or false", value)
+        return value
+
+    def choice(self, key: str, default: str, choices: Sequence[str]) -> str:
+        """Take one of the words `choices`."""
+        value = self.take(key, default)
+        if value not in choices:
+            raise scene_error(self.name(key), "one of " + ", ".join(choices), value)
+        return str(value)
+
+    def vector(
+        self, key: str, default: Sequence[float], length: int = 3
+    ) -> NDArray[np.float64]:
+        """Take `length` finite numbers; a single number stands for equal ones."""
+        value = self.take(key, default)
+        entries = [value] * length if isinstance(value, int | float) else value
+        return check_vector(self.name(key), entries, length)
+
+    def numbers(self, key: str, default: Sequence[float]) -> NDArray[np.float64]:
+        """Take a list of any length of finite numbers."""
+        value = self.take(key, default)
+        length = len(value) if isinstance(value, list | tuple) else 0
+        return check_vector(self.name(key), value, length)
+
+    def file(self, key: str, folder: Path) -> Path:
+        """Take the path of an existing file, relative to the scene's folder."""
+        path = folder / str(self.require(key))
+        if not path.is_file():
+            raise scene_error(
+                self.name(key), "an existing file", str(path), "paths are relative to the scene"
+            )
+        return path
+
+    def finish(self) -> None:
+        """Refuse keys that nobody took."""
+        if self._left:
+            unknown = ", ".join(repr(key) for key in sorted(self._left))
+            known = ", ".join(sorted(self._known)) or "none"
+            raise scene_error(self.what, f"keys {known}", unknown, "remove or correct it")
+
+
+def check_number(
+    what: str, value: Any, *, low: float = -math.inf, high: float = math.inf
+) -> float:
+    """`value` as a finite float in [low, high]; a `SceneError` if it is not.
+
+    Examples
+    --------
+    >>> check_number("albedo", 1, low=0, high=1)
+    1.0
+    """
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or not low <= value <= high:
+        raise scene_error(what, f"a number in [{low:g}, {high:g}]", value)
+    return float(value)
+
+
+def check_vector(what: str, value: Any, length: int) -> NDArray[np.float64]:
+    """`value` as `length` finite floats; a `SceneError` if it is not.
+
+    Examples
+    --------
+    >>> check_vector("target", [0, 0, 0.1], 3)
+    array([0. , 0. , 0.1])
+    """
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != length or not length:
+        raise scene_error(what, f"a list of {length or 'one or more'} numbers", value)
+    return np.array([check_number(what, _plain(entry)) for entry in value])
+
+
+def _plain(entry: Any) -> Any:
+    return entry.item() if isinstance(entry, np.generic) else entry
