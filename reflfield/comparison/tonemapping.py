@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reflfield.capture.images import encode_srgb
+
 # Rec. 709: the weights of the colour space that all radiance is stored in.
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 
@@ -34,10 +36,7 @@ def luminance(image: ArrayLike) -> NDArray[np.float64]:
 
 
 def display(image: ArrayLike, exposure: float) -> NDArray[np.float64]:
-    r"""Displayed value of linear radiance: ``sRGB(clip(exposure * image, 0, 1))``.
-
-    The transfer function of IEC 61966-2-1: :math:`12.92\,x` up to 0.0031308, then
-    :math:`1.055\,x^{1/2.4} - 0.055`.
+    """Displayed value of linear radiance: ``sRGB(clip(exposure * image, 0, 1))``.
 
     Parameters
     ----------
@@ -56,7 +55,5 @@ def display(image: ArrayLike, exposure: float) -> NDArray[np.float64]:
     >>> display([-1.0, 0.00155, 0.5, 7.0], exposure=2.0).round(4)
     array([0.    , 0.0401, 1.    , 1.    ])
     """
-    linear = np.clip(np.asarray(image, dtype=np.float64) * exposure, 0.0, 1.0)
-    return np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1 / 2.4) - 0.055
-    )
+    exposed = np.asarray(image, dtype=np.float64) * exposure
+    return np.asarray(encode_srgb(exposed), dtype=np.float64)

@@ -1,0 +1,253 @@
+"""Scores against truth: planted distances, angles, holes; files that lie."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from reflfield.comparison.truth import (
+    SurfacePoints,
+    TruthView,
+    angle_deg,
+    completion_error,
+    frame_errors,
+    hull_distance,
+    open_truth,
+    surface_points,
+)
+from reflfield.errors import CaptureError, InputError, ShapeError
+
+
+def sphere(radius, centre=(0, 0, 0), subdivisions=4):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return mesh.vertices + np.asarray(centre), mesh.faces
+
+
+# --- hull -------------------------------------------------------------------------
+
+
+def test_concentric_spheres_are_their_radii_apart():
+    # Facets of the finer sphere lie up to r (1 - cos(edge / 2)), 0.05 % of r, below it.
+    found = hull_distance(sphere(0.11), sphere(0.10), voxel=0.002).summary()
+    assert found["mean_mm"] == pytest.approx(10, abs=0.1)
+    assert found["mean_voxels"] == pytest.approx(5, abs=0.05)
+    assert found["outside_share"] == 1
+    inner = hull_distance(sphere(0.09), sphere(0.10))
+    assert inner.outside == 0
+    assert inner.signed.mean() == pytest.approx(-0.01, abs=1e-4)
+
+
+def test_half_of_a_shifted_sphere_is_outside():
+    found = hull_distance(sphere(1, centre=(0.02, 0, 0)), sphere(1))
+    # Signed distance is the shift times the cosine: uniform in +-0.02, mean size 0.01.
+    assert np.abs(found.signed).mean() == pytest.approx(0.01, abs=4e-4)
+    assert found.outside == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.reference
+def test_distances_are_those_of_trimesh_far_from_the_origin(rng):
+    truth = trimesh.creation.annulus(0.3, 0.5, 0.4)
+    hull = trimesh.creation.cylinder(0.52, 0.44)
+    away = np.array([40.0, -7.0, 13.0])
+    found = hull_distance(
+        (hull.vertices + away, hull.faces), (truth.vertices + away, truth.faces), n_samples=500
+    )
+    expected = hull_distance(
+        (hull.vertices, hull.faces), (truth.vertices, truth.faces), n_samples=500
+    )
+    assert np.allclose(found.signed, expected.signed, atol=1e-6)  # float32 of a size 1 mesh
+    # The cap over the bore is nearest to the bore's rim, by hand:
+    # its middle lies hypot(0.3, 0.02) away (half heights 0.22 and 0.20).
+    assert found.signed.max() == pytest.approx(math.hypot(0.3, 0.02), rel=0.1)
+    assert found.outside == 1
+
+
+def test_shares_of_either_side_are_those_of_the_areas():
+    """A box around an ellipsoid's waist: sides told apart by the ellipsoid's equation."""
+    axes = np.array([1.0, 0.5, 0.7])
+    truth = trimesh.creation.icosphere(subdivisions=4)
+    hull = trimesh.creation.box([1.2, 0.7, 0.9])
+    found = hull_distance((hull.vertices, hull.faces), (truth.vertices * axes, truth.faces))
+    points, _ = trimesh.sample.sample_surface(hull, 20_000, seed=1)
+    inside = ((points / axes) ** 2).sum(axis=1) < 1
+    assert 0.1 < inside.mean() < 0.9
+    # Binomial deviation of 20,000 free draws is 0.0035.
+    assert 1 - found.outside == pytest.approx(inside.mean(), abs=0.015)
+
+
+def test_hull_without_faces_or_area_is_refused():
+    nothing = np.zeros((0, 3))
+    with pytest.raises(InputError, match="hull: expected a mesh with faces"):
+        hull_distance((nothing, nothing), sphere(1))
+    with pytest.raises(InputError, match="degenerate"):
+        hull_distance((np.zeros((3, 3)), [[0, 1, 2]]), sphere(1))
+    with pytest.raises(InputError, match="voxel"):
+        hull_distance(sphere(1), sphere(1), voxel=0.0)
+
+
+# --- frames -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def surface(rng):
+    """Surface points on a sphere with random shading frames."""
+    frames = Rotation.random(500, random_state=rng).as_matrix()
+    position = rng.normal(size=(500, 3))
+    position /= np.linalg.norm(position, axis=1, keepdims=True)
+    points = SurfacePoints(position, frames[:, 2], frames[:, 0], rng.integers(0, 3, 500))
+    return points, frames
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-6, 3.0, 89.0])
+def test_planted_tilts_and_turns_are_found(surface, degrees, rng):
+    points, frames = surface
+    # Turning about the tangent (row 0) tilts the normal only, and the reverse.
+    tilt, turn = (
+        Rotation.from_rotvec(np.radians(degrees) * a).as_matrix() for a in np.eye(3)[[0, 2]]
+    )
+    tilted = frame_errors(points.position, tilt @ frames, points, 1e-9)
+    turned = frame_errors(points.position, turn @ frames, points, 1e-9)
+    tolerance = 1e-9  # degrees; arctan2 of unit vectors is good to about 1e-13
+    assert np.allclose(tilted.normal, degrees, atol=tolerance)
+    assert np.allclose(tilted.tangent, 0, atol=tolerance)
+    assert np.allclose(turned.normal, 0, atol=tolerance)
+    assert np.allclose(turned.tangent, degrees, atol=tolerance)
+    assert np.array_equal(turned.label, points.label)
+
+
+def test_tangents_are_lines(surface):
+    points, frames = surface
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    errors = frame_errors(points.position, half_turn @ frames, points, 1e-9)
+    assert np.allclose(errors.tangent, 0, atol=1e-9)
+
+
+def test_world_frame_does_not_matter(surface, rng):
+    points, frames = surface
+    noisy = Rotation.from_rotvec(rng.normal(0, 0.1, (500, 3))).as_matrix() @ frames
+    world = Rotation.random(random_state=rng).as_matrix()
+    moved = SurfacePoints(
+        *(v @ world.T for v in (points.position, points.normal, points.tangent)), points.label
+    )
+    before = frame_errors(points.position, noisy, points, 1e-6)
+    after = frame_errors(points.position @ world.T, noisy @ world.T, moved, 1e-6)
+    assert np.allclose(before.normal, after.normal, atol=1e-9)
+    assert np.allclose(before.tangent, after.tangent, atol=1e-9)
+
+
+def test_far_texels_and_broken_frames_are_left_out(surface):
+    points, frames = surface
+    positions, broken = points.position.copy(), frames.copy()
+    positions[3] *= 2
+    broken[5] = np.nan
+    errors = frame_errors(positions, broken, points, 0.01)
+    assert np.array_equal(errors.texel, np.setdiff1d(np.arange(500), [3, 5]))
+    assert errors.summary()["n_texels"] == 498
+
+
+@pytest.mark.stability
+def test_nothing_to_match_is_defined():
+    empty = surface_points([])
+    errors = frame_errors(np.zeros((2, 3)), np.stack([np.eye(3)] * 2), empty, 1.0)
+    assert errors.summary()["n_texels"] == 0
+    assert math.isnan(errors.summary()["normal_mean_deg"])
+
+
+def test_pixels_that_miss_are_no_surface_points():
+    view = small_view()
+    points = surface_points([view, view])
+    assert len(points.position) == 2 * 10
+    assert len(surface_points([view] * 4, max_points=20).position) == 20
+    assert (points.label >= 0).all()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 90.0, 179.9999, 180.0])
+def test_angles_are_accurate_at_their_ends(angle):
+    turned = [np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0]
+    assert angle_deg([1e-3, 0, 0], turned) == pytest.approx(angle, rel=1e-9, abs=1e-13)
+
+
+# --- completion -------------------------------------------------------------------
+
+
+def test_completion_error_counts_only_its_own_entries(rng):
+    true = rng.uniform(0.1, 1, (5, 6, 7, 3))
+    observed = rng.uniform(size=(5, 6, 7)) < 0.6
+    completed = np.where(observed[..., None], true * 1.01, true * 0.8)
+    error = completion_error(completed, true, observed)
+    assert error.unobserved == pytest.approx(0.2, rel=1e-9)
+    assert error.observed == pytest.approx(0.01, rel=1e-9)
+    assert error.unobserved_cube_root == pytest.approx(1 - 0.8 ** (1 / 3), rel=1e-9)
+    assert error.n_unobserved == 3 * (~observed).sum()
+
+
+@pytest.mark.stability
+def test_completion_error_of_degenerate_input():
+    error = completion_error(np.ones(3), np.ones(3), np.ones(3, bool))
+    assert math.isnan(error.unobserved)
+    assert completion_error([np.nan, 1], [np.nan, 1], [False, False]).n_unobserved == 1
+    with pytest.raises(InputError, match="completed"):
+        completion_error([np.nan, 1], [1, 1], [False, True])
+    with pytest.raises(ShapeError, match="completed"):
+        completion_error(np.ones((3, 2)), np.ones((3, 2)), np.ones(2, bool))
+
+
+# --- files ------------------------------------------------------------------------
+
+
+def small_view():
+    label = np.full((4, 5), -1, np.int16)
+    label[1:3] = 0
+    unit = np.zeros((4, 5, 3), np.float32)
+    unit[1:3, :, 2] = 1
+    depth = np.where(label >= 0, 1, np.inf).astype(np.float32)
+    return TruthView(depth, np.where(unit == 1, 1, np.nan_to_num(unit)), unit, unit, label)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    (tmp_path / "truth" / "views").mkdir(parents=True)
+    (tmp_path / "truth" / "truth.json").write_text(
+        json.dumps({"version": 1, "mesh": "truth/mesh.ply"})
+    )
+    vertices, faces = sphere(1, subdivisions=1)
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "truth" / "mesh.ply")
+    np.savez(tmp_path / "truth" / "views" / "v000.npz", **vars(small_view()))
+    return tmp_path
+
+
+def test_truth_is_read_from_its_files(capture):
+    truth = open_truth(capture)
+    vertices, faces = truth.mesh()
+    assert vertices.shape == (42, 3)
+    assert faces.shape == (80, 3)
+    assert np.array_equal(truth.view("v000").label, small_view().label)
+    assert truth.has_view("v000")
+    assert not truth.has_view("v001")
+    assert truth.heldout() is None
+    assert truth.samples() is None
+
+
+def test_captures_without_truth_have_none(tmp_path):
+    assert open_truth(tmp_path) is None
+
+
+def test_truth_that_lies_is_refused(capture):
+    truth = open_truth(capture)
+    with pytest.raises(CaptureError, match="inside"):
+        truth.view("../../../secret")
+    with pytest.raises(CaptureError, match=r"v009\.npz"):
+        truth.view("v009")
+    (capture / "truth" / "truth.json").write_text('{"version": 2}')
+    with pytest.raises(CaptureError, match="version 1, received 2"):
+        open_truth(capture)
+    (capture / "truth" / "truth.json").write_text("[1]")
+    with pytest.raises(CaptureError, match="version"):
+        open_truth(capture)
+    (capture / "truth" / "truth.json").write_text("{")
+    with pytest.raises(CaptureError, match="JSON"):
+        open_truth(capture)
