@@ -25,6 +25,7 @@ from PIL.Image import Image
 from reflfield.errors import CaptureError, InputError, ShapeError
 
 Float32 = NDArray[np.float32]
+Window = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 # A header that asks for more is damaged or hostile: 2^28 pixels are 3 GB of float32 RGB.
 MAX_PIXELS = 2**28
@@ -147,11 +148,7 @@ def image_size(path: Path | str) -> tuple[int, int]:
     """
     path = Path(path)
     if _is_exr(path):
-        with (
-            _named(path, "an OpenEXR image"),
-            OpenEXR.File(str(path), header_only=True) as file,
-        ):
-            low, high = _window(file.header(), "displayWindow")
+        low, high = _exr_windows(path)[0]
         return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
     with _named(path, "PNG, JPEG or TIFF"), _picture(path) as picture:
         width, height = picture.size
@@ -408,36 +405,41 @@ def _exr_rgb(path: Path) -> Float32:
 
 def _exr_channels(path: Path) -> dict[str, Float32]:
     """All channels of the first part, placed in the display window."""
-    width, height = image_size(path)
-    _check_size(path, width, height)
-    with _named(path, "an OpenEXR image"):
-        with OpenEXR.File(str(path), header_only=True) as file:
-            low, high = _window(file.header(), "dataWindow")
+    display, data = _exr_windows(path)
+    for low, high in (display, data):
         _check_size(path, *(int(n) for n in high - low + 1))
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            header = file.header()
-            stored = {name: c.pixels for name, c in file.channels().items()}
-        return {name: _in_display_window(p, header) for name, p in stored.items()}
+    with (
+        _named(path, "an OpenEXR image"),
+        OpenEXR.File(str(path), separate_channels=True) as file,
+    ):
+        return {
+            name: _in_display_window(channel.pixels, display, data)
+            for name, channel in file.channels().items()
+        }
 
 
-def _window(header: Mapping[str, Any], name: str) -> tuple[NDArray[Any], NDArray[Any]]:
-    low, high = header[name]
-    return np.asarray(low, dtype=np.int64), np.asarray(high, dtype=np.int64)
+def _exr_windows(path: Path) -> tuple[Window, Window]:
+    """Display and data window of an EXR: lowest and highest (x, y), both included."""
+    with (
+        _named(path, "an OpenEXR image"),
+        OpenEXR.File(str(path), header_only=True) as file,
+    ):
+        header = file.header()
+        display, data = (
+            np.array(header[name], dtype=np.int64) for name in ("displayWindow", "dataWindow")
+        )
+    return (display[0], display[1]), (data[0], data[1])
 
 
-def _in_display_window(pixels: NDArray[Any], header: Mapping[str, Any]) -> Float32:
+def _in_display_window(pixels: NDArray[Any], display: Window, data: Window) -> Float32:
     """Crop or pad (with 0) a data window to the display window."""
-    low, high = _window(header, "displayWindow")
-    data_low, data_high = _window(header, "dataWindow")
-    if (low == data_low).all() and (high == data_high).all():
-        return pixels.astype(np.float32)
-    size = high - low + 1
+    size = display[1] - display[0] + 1
     image = np.zeros((size[1], size[0]), dtype=np.float32)
-    first, last = np.maximum(low, data_low), np.minimum(high, data_high) + 1
+    first, last = np.maximum(display[0], data[0]), np.minimum(display[1], data[1]) + 1
     if (first < last).all():
-        target, source = np.array([first, last]) - low, np.array([first, last]) - data_low
-        cut = pixels[source[0, 1] : source[1, 1], source[0, 0] : source[1, 0]]
-        image[target[0, 1] : target[1, 1], target[0, 0] : target[1, 0]] = cut
+        (x0, y0), (x1, y1) = first - display[0], last - display[0]
+        (u0, v0), (u1, v1) = first - data[0], last - data[0]
+        image[y0:y1, x0:x1] = pixels[v0:v1, u0:u1]
     return image
 
 

@@ -23,7 +23,8 @@ DIRECTIONAL = "directional"
 SPOT = "spot"
 ENVIRONMENT = "environment"
 UNKNOWN = "unknown"
-KINDS = (POINT, DIRECTIONAL, SPOT, ENVIRONMENT, UNKNOWN)
+GROUP = "group"
+KINDS = (POINT, DIRECTIONAL, SPOT, ENVIRONMENT, UNKNOWN, GROUP)
 
 # Orientation of latitude-longitude maps, as the programs that write them name it.
 CONVENTIONS = ("openexr", "mitsuba", "blender")
@@ -48,9 +49,10 @@ class Light:
     ----------
     id : str
         Unique name within the capture.
-    kind : {"point", "directional", "spot", "environment", "unknown"}
+    kind : {"point", "directional", "spot", "environment", "unknown", "group"}
         ``unknown`` is a constant lighting that was not measured: one condition, whose
-        irradiance counts as 1 everywhere.
+        irradiance counts as 1 everywhere. ``group`` is several lights at once, as a frame
+        to relight may name.
     position : (3,) array_like
         World position, metres (point, spot).
     direction : (3,) array_like
@@ -69,6 +71,8 @@ class Light:
         Environment: how the map's pixels turn into directions.
     world_from_environment : (3, 3) array_like
         Environment: rotation from the map's frame to the world.
+    members : tuple of Light
+        Group: the lights that are on together.
 
     Raises
     ------
@@ -97,6 +101,7 @@ class Light:
     file: Path | None = None
     convention: str = "openexr"
     world_from_environment: Array = field(default_factory=lambda: np.eye(3))
+    members: tuple[Light, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -114,6 +119,13 @@ class Light:
         _check_spot(self)
         if self.kind == ENVIRONMENT:
             _check_environment(self)
+        if self.kind == GROUP and not self.members:
+            raise CaptureError(f"light {self.id!r}: a group needs at least one light")
+
+    @property
+    def sources(self) -> tuple[Light, ...]:
+        """The single lights that are on: the members of a group, else this light."""
+        return self.members if self.kind == GROUP else (self,)
 
     @property
     def known(self) -> bool:
@@ -128,7 +140,7 @@ class Light:
         Raises
         ------
         InputError
-            For an environment, which has no single direction.
+            For an environment or a group, which have no single direction.
         """
         world = self._points(points)
         if self.kind in (POINT, SPOT):
@@ -159,10 +171,10 @@ class Light:
         return falloff[:, None] * self.intensity
 
     def _points(self, points: ArrayLike) -> Array:
-        if self.kind == ENVIRONMENT:
+        if self.kind in (ENVIRONMENT, GROUP):
             raise InputError(
-                f"light {self.id!r}: an environment has no single direction or irradiance; "
-                "integrate over its map"
+                f"light {self.id!r}: expected a single light, received kind {self.kind!r}, "
+                "which has no single direction or irradiance; sum over its map or its members"
             )
         world = np.asarray(points, dtype=np.float64)
         check_shape("points", world, (None, 3))

@@ -360,6 +360,7 @@ def _light_text(light: Light) -> str:
     numbers: list[Any] = [light.position.tolist(), light.direction.tolist()]
     numbers += [light.intensity.tolist(), light.exponent, light.cone_angle, light.falloff_angle]
     numbers += [light.convention, light.world_from_environment.tolist()]
+    numbers += [_light_text(member) for member in light.members]
     return f"{light.id} {light.kind} {numbers}"
 
 

@@ -1,0 +1,122 @@
+"""Reader of Middlebury multi-view stereo captures: ``*_par.txt`` beside the photographs.
+
+Line 1 holds the number of images; each further line the image name, K and R row by row, and
+t, with ``x_pixel ~ K [R | t] x_world``. Their pixel centres are whole numbers; ours lie at
+.5, so half a pixel is added to the principal point. The lighting was not measured and moves
+with no camera: one unknown light.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.cameras import Camera
+from reflfield.capture.documents import frame_name, path_inside, read_text, unique_names
+from reflfield.capture.images import image_size
+from reflfield.capture.lights import Light
+from reflfield.capture.model import Capture, Exposure, Photograph
+from reflfield.capture.orientation import estimated_up
+from reflfield.errors import CaptureError
+
+SUFFIX = "_par.txt"
+N_NUMBERS = 21
+
+# Skew of a sensor's axes, in pixels per pixel, that cannot be told from rounding.
+LARGEST_SKEW = 1e-6
+
+
+def read_middlebury(description: Path) -> Capture:
+    """Read a Middlebury capture.
+
+    Parameters
+    ----------
+    description : Path
+        Its ``*_par.txt``.
+
+    Returns
+    -------
+    Capture
+        One camera and one photograph per line; image sizes come from the image headers.
+
+    Raises
+    ------
+    CaptureError
+        If the count and the lines disagree, a line is malformed, an image is missing, or
+        a calibration is not one.
+    """
+    root = description.parent
+    lines = [line.split() for line in read_text(description).splitlines() if line.strip()]
+    rows = lines[1:]
+    if not rows or not lines[0][0].isdigit() or int(lines[0][0]) != len(rows):
+        raise CaptureError(
+            f"{description}: expected the number of images in line 1 and as many lines, "
+            f"received {' '.join(lines[0]) if lines else 'nothing'!r} and {len(rows)} lines"
+        )
+    parsed = [_parsed(row, description) for row in rows]
+    paths = [path_inside(root, name, description) for name, _ in parsed]
+    cameras = tuple(
+        _camera(name, numbers, image_size(path), description)
+        for (name, numbers), path in zip(parsed, paths, strict=True)
+    )
+    return Capture(
+        name=root.resolve().name,
+        root=root,
+        cameras=cameras,
+        lights=(Light("constant", "unknown"),),
+        photographs=tuple(
+            Photograph(name, view, 0, (Exposure(path),))
+            for view, (name, path) in enumerate(
+                zip(unique_names(paths, root), paths, strict=True)
+            )
+        ),
+        up=estimated_up(cameras),
+        format="middlebury",
+        description=description,
+    )
+
+
+def _parsed(row: list[str], description: Path) -> tuple[str, NDArray[np.float64]]:
+    """Image name and the 21 numbers of a line; names may hold spaces."""
+    name = " ".join(row[:-N_NUMBERS])
+    try:
+        numbers = np.array([float(token) for token in row[-N_NUMBERS:]])
+    except ValueError:
+        numbers = np.zeros(0)
+    if not name or len(numbers) != N_NUMBERS or not np.isfinite(numbers).all():
+        raise CaptureError(
+            f"{description}: expected an image name and {N_NUMBERS} finite numbers (K, R, t), "
+            f"received {' '.join(row)[:200]!r}"
+        )
+    return name, numbers
+
+
+def _camera(
+    name: str, numbers: NDArray[np.float64], size: tuple[int, int], description: Path
+) -> Camera:
+    intrinsic = numbers[:9].reshape(3, 3)
+    if abs(np.linalg.det(intrinsic)) < 1e-12:
+        raise CaptureError(
+            f"{description}: camera {name!r}: camera matrix K is singular: {intrinsic.tolist()}"
+        )
+    intrinsic = intrinsic / intrinsic[2, 2]
+    if abs(intrinsic[0, 1]) > LARGEST_SKEW * intrinsic[0, 0]:
+        raise CaptureError(
+            f"{description}: camera {name!r}: expected K without skew, received "
+            f"{intrinsic[0, 1]}; rectify the photographs first"
+        )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = numbers[9:18].reshape(3, 3), numbers[18:]
+    return Camera(
+        id=frame_name(Path(name)),
+        kind="opencv",
+        width=size[0],
+        height=size[1],
+        fl_x=float(intrinsic[0, 0]),
+        fl_y=float(intrinsic[1, 1]),
+        cx=float(intrinsic[0, 2]) + 0.5,
+        cy=float(intrinsic[1, 2]) + 0.5,
+        camera_from_world=pose,
+    )

@@ -1,0 +1,110 @@
+"""Opening a capture: which reader, and the checks that every capture passes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from reflfield.capture import lp, middlebury, native, transforms_json
+from reflfield.capture.documents import read_json, read_text
+from reflfield.capture.model import Capture, check_pairs, check_photographs
+from reflfield.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A way to read captures: the files it recognises by name, and how it reads them."""
+
+    pattern: str  # glob, within the capture's folder
+    read: Callable[[Path], Capture]
+
+
+READERS = {
+    "native": Reader(native.FILE_NAME, native.read_native),
+    "transforms": Reader(transforms_json.FILE_NAME, transforms_json.read_transforms),
+    "middlebury": Reader("*" + middlebury.SUFFIX, middlebury.read_middlebury),
+    "lp": Reader("*" + lp.SUFFIX, lp.read_lp),
+}
+
+
+def open_capture(
+    path: Path | str, format: str | None = None, *, require_photographs: bool = True
+) -> Capture:
+    """Open a capture, or frames to relight.
+
+    Parameters
+    ----------
+    path : Path or str
+        A folder with exactly one description in it, or a description file.
+    format : {"native", "transforms", "middlebury", "lp"}, optional
+        Reader to use; None tells by content.
+    require_photographs : bool
+        Whether every photograph must exist, once per camera and light, in its camera's
+        size. False for frames that are only rendered.
+
+    Returns
+    -------
+    Capture
+
+    Raises
+    ------
+    CaptureError
+        If there is no description or several, or what it describes cannot be used.
+    """
+    if format is not None and format not in READERS:
+        raise CaptureError(f"format: expected {', '.join(READERS)}, received {format!r}")
+    path = Path(path)
+    if not path.exists():
+        raise CaptureError(
+            f"{path}: expected a capture's folder or description; does not exist"
+        )
+    if path.is_dir():
+        description, found = _description_in(path, format)
+    else:
+        description, found = path, format or _kind_of_file(path)
+    capture = READERS[found].read(description)
+    if require_photographs:
+        check_pairs(capture)
+        check_photographs(capture)
+    return capture
+
+
+def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
+    """The one description in a folder and its format."""
+    found = [
+        (file, name)
+        for name, reader in READERS.items()
+        if format in (None, name)
+        for file in sorted(folder.glob(reader.pattern))
+        if file.is_file()
+    ]
+    if len(found) == 1:
+        return found[0]
+    wanted = ", ".join(r.pattern for name, r in READERS.items() if format in (None, name))
+    received = ", ".join(file.name for file, _ in found) or "none of them"
+    remedy = "name the file itself" if found else "is this the capture's own folder?"
+    raise CaptureError(f"{folder}: expected one of {wanted}, received {received}; {remedy}")
+
+
+def _kind_of_file(path: Path) -> str:
+    """Format of a description file, by what it holds."""
+    text = read_text(path)
+    if text.lstrip().startswith("{"):
+        document = read_json(path)
+        if document.get("format") == native.FORMAT:
+            return "native"
+        if "frames" in document:
+            return "transforms"
+    else:
+        lines = [line for line in text.splitlines() if line.strip()]
+        words = lines[1].split() if len(lines) > 1 and lines[0].strip().isdigit() else []
+        if len(words) > middlebury.N_NUMBERS:
+            return "middlebury"
+        if len(words) > 3:
+            return "lp"
+    raise CaptureError(
+        f"{path}: expected a capture description (capture.json, transforms.json, *_par.txt or "
+        f"*.lp), received {json.dumps(text[:40])}"
+    )
