@@ -1,0 +1,402 @@
+"""Samples of a reflectance field: any texel, any view, any light.
+
+Directions are rotated into the texel's frame and interpolated bilinearly on
+the grid of views (4 taps) and of lights (4 taps). A direction below the local
+horizon reads the horizon. Light from below the horizon fades out: local frames
+follow the data, not the base geometry, so a frame may be tilted against the
+light by a few degrees without the surface being dark.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.checks import check_shape
+from reflfield.errors import InputError
+from reflfield.field.model import ReflectanceField
+from reflfield.sphere.hemisphere import first_tap, square_from_xyz
+
+# Light this far below a texel's horizon, as the sine of 5 degrees, counts
+# nothing; between here and the horizon its share rises as a smoothstep.
+FADE_DEPTH = 0.0872
+
+
+# Kernel helpers are typed by numba; to mypy their scalars are Any.
+
+
+@numba.njit(cache=True, nogil=True)
+def _local_taps(frame: Any, direction: Any, side: int) -> Any:
+    """First node, steps to the next column and row, shares of those, local z."""
+    x = frame[0, 0] * direction[0] + frame[0, 1] * direction[1] + frame[0, 2] * direction[2]
+    y = frame[1, 0] * direction[0] + frame[1, 1] * direction[1] + frame[1, 2] * direction[2]
+    z = frame[2, 0] * direction[0] + frame[2, 1] * direction[1] + frame[2, 2] * direction[2]
+    if side == 1:
+        # One node four times, and no horizon: the direction does not vary.
+        return 0, 0, 0, np.float32(0.0), np.float32(0.0), np.float32(1.0)
+    u, v = square_from_xyz(x, y, z)
+    column, s = first_tap(u, side)
+    row, t = first_tap(v, side)
+    return row * side + column, 1, side, np.float32(s), np.float32(t), np.float32(z)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _corner(index: int, taps: Any) -> Any:
+    """Node and weight of one of the four corners of `_local_taps`."""
+    first, column, row, s, t, _ = taps
+    along_s = s if index & 1 else np.float32(1.0) - s
+    along_t = t if index & 2 else np.float32(1.0) - t
+    return first + (index & 1) * column + (index >> 1) * row, along_s * along_t
+
+
+@numba.njit(cache=True, nogil=True)
+def _inverse_domain(value: Any, power: int) -> Any:
+    if not value > 0:
+        return np.float32(0.0)
+    if power == 3:
+        return value * value * value
+    if power == 2:
+        return value * value
+    return value
+
+
+@numba.njit(cache=True, nogil=True)
+def _share_of_light(z: Any) -> Any:
+    share = min(max(1.0 + z / FADE_DEPTH, 0.0), 1.0)
+    return np.float32(share * share * (3.0 - 2.0 * share))
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_taps(nodes: Any, view_taps: Any, light_taps: Any, tap_sum: Any) -> None:
+    """Add the 16 taps of all components and channels to `tap_sum`."""
+    for a in range(4):
+        view_node, view_weight = _corner(a, view_taps)
+        for b in range(4):
+            light_node, light_weight = _corner(b, light_taps)
+            weight = view_weight * light_weight
+            tap = nodes[view_node, light_node]
+            for k in range(tap.shape[0]):
+                for channel in range(3):
+                    tap_sum[k, channel] += weight * tap[k, channel]
+
+
+@numba.njit(cache=True, nogil=True)
+def _evaluate(
+    table: NDArray[np.float32],
+    component_weights: NDArray[np.float32],
+    cluster: NDArray[np.int32],
+    local_from_world: NDArray[np.float32],
+    sides: tuple[int, int],
+    power: int,
+    texels: NDArray[np.int32],
+    views: NDArray[np.float32],
+    lights: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    tap_sum = np.zeros((table.shape[3], 3), np.float32)
+    for i in range(len(texels)):
+        texel = texels[i]
+        if texel < 0:
+            continue
+        view_taps = _local_taps(local_from_world[texel], views[i], sides[0])
+        light_taps = _local_taps(local_from_world[texel], lights[i], sides[1])
+        share = _share_of_light(light_taps[5])
+        if share == 0.0:
+            continue
+        tap_sum[:] = 0.0
+        _add_taps(table[cluster[texel]], view_taps, light_taps, tap_sum)
+        for channel in range(3):
+            value = np.float32(0.0)
+            for k in range(tap_sum.shape[0]):
+                value += component_weights[texel, k] * tap_sum[k, channel]
+            out[i, channel] = share * _inverse_domain(value, power)
+
+
+@numba.njit(cache=True, nogil=True)
+def _light_response(
+    table: NDArray[np.float32],
+    component_weights: NDArray[np.float32],
+    cluster: NDArray[np.int32],
+    local_from_world: NDArray[np.float32],
+    view_side: int,
+    texels: NDArray[np.int32],
+    views: NDArray[np.float32],
+    out: NDArray[np.float32],
+) -> None:
+    for i in range(len(texels)):
+        texel = texels[i]
+        if texel < 0:
+            continue
+        taps = _local_taps(local_from_world[texel], views[i], view_side)
+        for a in range(4):
+            view_node, corner = _corner(a, taps)
+            nodes = table[cluster[texel], view_node]
+            for node in range(table.shape[2]):
+                for k in range(table.shape[3]):
+                    weight = corner * component_weights[texel, k]
+                    for channel in range(3):
+                        out[i, node, channel] += weight * nodes[node, k, channel]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_lights(
+    responses: NDArray[np.float32],
+    local_from_world: NDArray[np.float32],
+    light_side: int,
+    power: int,
+    texels: NDArray[np.int32],
+    lights: NDArray[np.float32],
+    irradiances: NDArray[np.float32],
+    lit: NDArray[np.bool_],
+    out: NDArray[np.float32],
+) -> None:
+    for i in range(len(texels)):
+        texel = texels[i]
+        if texel < 0:
+            continue
+        for j in range(len(lights)):
+            if not lit[i % len(lit), j]:
+                continue
+            taps = _local_taps(local_from_world[texel], lights[j], light_side)
+            share = _share_of_light(taps[5])
+            if share == 0.0:
+                continue
+            for channel in range(3):
+                value = np.float32(0.0)
+                for b in range(4):
+                    node, corner = _corner(b, taps)
+                    value += corner * responses[i, node, channel]
+                radiance = irradiances[j, channel] * _inverse_domain(value, power)
+                out[i, channel] += share * radiance
+
+
+def evaluate(
+    field: ReflectanceField, texels: ArrayLike, views_world: ArrayLike, lights_world: ArrayLike
+) -> NDArray[np.float32]:
+    """Samples of texels for pairs of directions.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+        Field to read.
+    texels : (n,) int
+        Texels; -1 gives zero.
+    views_world, lights_world : (n, 3) float
+        Unit vectors to the viewer and to the light, world frame.
+
+    Returns
+    -------
+    (n, 3) float32
+        Radiance divided by the irradiance of a surface facing the light,
+        1/sr, cosine included, never negative.
+
+    Raises
+    ------
+    ShapeError
+        If the shapes differ.
+    InputError
+        If a texel does not exist.
+
+    Notes
+    -----
+    16 taps of K + 1 components and 3 channels a sample; no memory beyond the
+    result.
+    """
+    index, views = _checked(field, texels, "views_world", views_world)
+    _, lights = _checked(field, texels, "lights_world", lights_world)
+    out = np.zeros((len(index), 3), np.float32)
+    _evaluate(
+        field.node_table,
+        field.component_weights,
+        field.cluster,
+        field.local_from_world,
+        (field.view_side, field.light_side),
+        field.inverse_power,
+        index,
+        views,
+        lights,
+        out,
+    )
+    return out
+
+
+def light_response(
+    field: ReflectanceField, texels: ArrayLike, views_world: ArrayLike
+) -> NDArray[np.float32]:
+    """Values at all light nodes, in the domain, for texels seen from given sides.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+        Field to read.
+    texels : (n,) int
+        Texels; -1 gives zero.
+    views_world : (n, 3) float
+        Unit vectors to the viewer, world frame.
+
+    Returns
+    -------
+    (n, n_light_nodes, 3) float32
+        Mean plus basis at the light nodes of the texel's own frame, in the
+        field's domain; may be negative.
+
+    Raises
+    ------
+    ShapeError
+        If the shapes differ.
+    InputError
+        If a texel does not exist.
+    """
+    index, views = _checked(field, texels, "views_world", views_world)
+    out = np.zeros((len(index), field.light_side**2, 3), np.float32)
+    _light_response(
+        field.node_table,
+        field.component_weights,
+        field.cluster,
+        field.local_from_world,
+        field.view_side,
+        index,
+        views,
+        out,
+    )
+    return out
+
+
+def sum_lights(
+    field: ReflectanceField,
+    texels: ArrayLike,
+    views_world: ArrayLike,
+    lights_world: ArrayLike,
+    irradiances: ArrayLike,
+    lit: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
+    """Radiance of texels under many distant lights that all texels share.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+        Field to read.
+    texels : (n,) int
+        Texels; -1 gives zero.
+    views_world : (n, 3) float
+        Unit vectors to the viewer.
+    lights_world : (m, 3) float
+        Unit vectors to the lights.
+    irradiances : (m, 3) float
+        Irradiance of a surface facing each light; for a part of an environment
+        its radiance times its solid angle.
+    lit : (n, m) bool, optional
+        True where light j reaches texel i; all by default.
+
+    Returns
+    -------
+    (n, 3) float32
+        Radiance.
+
+    Raises
+    ------
+    ShapeError
+        If shapes differ.
+    InputError
+        If a texel does not exist.
+
+    Notes
+    -----
+    The sum over views is done once for each texel, so a light costs 4 taps
+    of 3 channels whatever K is. Memory is ``n * n_light_nodes * 12`` bytes: pass
+    texels by blocks.
+    """
+    index, _ = _checked(field, texels, "views_world", views_world)
+    lights = np.ascontiguousarray(lights_world, np.float32)
+    check_shape("lights_world", lights, (None, 3))
+    powers = np.ascontiguousarray(irradiances, np.float32)
+    check_shape("irradiances", powers, (len(lights), 3))
+    # One row serves all texels when nothing is shadowed.
+    reached = np.ones((1, len(lights)), np.bool_) if lit is None else np.ascontiguousarray(lit)
+    if lit is not None:
+        check_shape("lit", reached, (len(index), len(lights)))
+    out = np.zeros((len(index), 3), np.float32)
+    _sum_lights(
+        light_response(field, index, views_world),
+        field.local_from_world,
+        field.light_side,
+        field.inverse_power,
+        index,
+        lights,
+        powers,
+        reached,
+        out,
+    )
+    return out
+
+
+def texel_taps(
+    field: ReflectanceField, uv: ArrayLike
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Texels around texture coordinates and their bilinear weights.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+        Field whose texture is read.
+    uv : (n, 2) float
+        Texture coordinates, v up; pixel centres at (column + 1/2) / width and
+        1 - (row + 1/2) / height. Outside [0, 1] the border is read.
+
+    Returns
+    -------
+    texels : (n, 4) int32
+        Texels of the four nearest pixels, -1 where a pixel has none.
+    weights : (n, 4) float32
+        Bilinear weights over the texels that exist; they sum to 1, or to 0
+        where none of the four exists.
+
+    Raises
+    ------
+    ShapeError
+        If `uv` is not (n, 2).
+
+    Notes
+    -----
+    The *samples* of the four texels are to be blended, not their frames or
+    coefficients: neighbours may belong to different clusters.
+    """
+    coordinates = np.asarray(uv, dtype=np.float64)
+    check_shape("uv", coordinates, (None, 2))
+    height, width = field.texel_of_pixel.shape
+    column, s = _pixel_taps(coordinates[:, 0] * width - 0.5, width)
+    row, t = _pixel_taps((1.0 - coordinates[:, 1]) * height - 0.5, height)
+    texels = field.texel_of_pixel[row[:, [0, 0, 1, 1]], column[:, [0, 1, 0, 1]]]
+    weights = t[:, [0, 0, 1, 1]] * s[:, [0, 1, 0, 1]] * (texels >= 0)
+    total = weights.sum(axis=1, keepdims=True)
+    np.divide(weights, total, out=weights, where=total > 0)
+    return texels, weights.astype(np.float32)
+
+
+def _pixel_taps(
+    position: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Two neighbouring pixels and their shares along one axis, clamped to the image."""
+    inside = np.clip(position, 0.0, size - 1.0)
+    lower = np.minimum(inside.astype(np.intp), max(size - 2, 0))
+    share = inside - lower
+    upper = np.minimum(lower + 1, size - 1)
+    return np.stack([lower, upper], axis=1), np.stack([1.0 - share, share], axis=1)
+
+
+def _checked(
+    field: ReflectanceField, texels: ArrayLike, name: str, directions: ArrayLike
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    index = np.ascontiguousarray(texels, np.int32)
+    check_shape("texels", index, (None,))
+    vectors = np.ascontiguousarray(directions, np.float32)
+    check_shape(name, vectors, (len(index), 3))
+    if index.size and not (index.min() >= -1 and index.max() < field.n_texels):
+        raise InputError(
+            f"texels: expected -1 to {field.n_texels - 1}, received "
+            f"{int(index.min())} to {int(index.max())}"
+        )
+    return index, vectors

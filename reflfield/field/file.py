@@ -1,0 +1,508 @@
+"""The file of a reflectance field, `field.rfld`, version 1.
+
+A ZIP archive of `header.json` and one NumPy `.npy` member for each array of
+`model.ARRAYS`. The header names format and version and, for each array, its
+dtype, shape, filter and the SHA-256 of its member. Integers are deflated;
+index arrays are first replaced by their differences, which deflate to a small
+part of their size. Time stamps are fixed, so equal fields give equal bytes.
+
+Opening reads the header alone; an array is read, and its checksum compared,
+when it is first used. Nothing is unpickled, nothing is extracted to disk, and
+no size is believed before it was compared with the size of the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.errors import FieldFileError, InputError
+from reflfield.field.model import (
+    ARRAYS,
+    ReflectanceField,
+    check_arrays,
+    check_options,
+    node_side,
+)
+
+FORMAT_NAME = "reflfield-field"
+FORMAT_VERSION = 1
+
+HEADER = "header.json"
+MAX_HEADER_BYTES = 16 << 20
+
+# More than the largest field that the evaluation could hold decoded; a file that
+# declares more is damaged or hostile. `open_field` takes another limit.
+MAX_BYTES = 8 << 30
+
+# An .npy header of version 1.0 is shorter than this; longer members do not fit
+# the array that they declare.
+NPY_HEADER_BYTES = 4096
+
+# Deflate cannot shrink by more than this factor (RFC 1951: 258 bytes in 2 bits).
+DEFLATE_LIMIT = 1032
+
+# The oldest date a ZIP archive can hold.
+FIXED_TIME = (1980, 1, 1, 0, 0, 0)
+
+# Index arrays are smooth: differences deflate better.
+DELTA_ARRAYS = ("faces", "texel_of_pixel")
+
+
+def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
+    """Write a field, atomically; equal fields give equal bytes.
+
+    Parameters
+    ----------
+    path : Path or str
+        Target. It is replaced only when the new file is complete and on disk.
+    reflectance_field : ReflectanceField
+        Field to write. Its metadata must be plain JSON values.
+
+    Raises
+    ------
+    InputError
+        If the metadata cannot be written as JSON.
+    OSError
+        If the target cannot be written.
+    """
+    with _replacing(Path(path)) as file, zipfile.ZipFile(file, "w") as archive:
+        members = {n: _npy_bytes(n, reflectance_field.arrays[n]) for n in ARRAYS}
+        header = _header(reflectance_field, members)
+        _add(archive, HEADER, header, zipfile.ZIP_DEFLATED)
+        for name, content in members.items():
+            packs = reflectance_field.arrays[name].dtype.kind in "iu"
+            method = zipfile.ZIP_DEFLATED if packs else zipfile.ZIP_STORED
+            _add(archive, member_name(name), content, method)
+
+
+def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceField:
+    """Open a field; its arrays are read when they are first used.
+
+    Parameters
+    ----------
+    path : Path or str
+        A file that `write_field` made.
+    max_bytes : int
+        Refuse a file whose arrays would take more memory than this.
+
+    Returns
+    -------
+    ReflectanceField
+
+    Raises
+    ------
+    FieldFileError
+        If the file is missing, not a field, damaged, of a newer version, or
+        declares sizes that its bytes do not bear out. A damaged array raises
+        when it is first used.
+    """
+    path = Path(path)
+    with _archive(path) as archive:
+        header = _read_header(path, archive)
+        infos = _members(path, archive)
+        declared = _declared(path, header)
+        for name, array in declared.items():
+            _check_size(path, name, array, infos[member_name(name)])
+    total = sum(array.n_bytes for array in declared.values())
+    if total > max_bytes:
+        raise FieldFileError(
+            f"{path}: expected arrays of at most {max_bytes} bytes, the header declares "
+            f"{total}; pass a larger max_bytes if the file is to be trusted"
+        )
+    with _naming(path):
+        return _field(header, declared, StoredArrays(path, declared))
+
+
+@dataclass(frozen=True)
+class DeclaredArray:
+    """What the header says of one array."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    filter: str
+    sha256: str
+
+    @property
+    def n_bytes(self) -> int:
+        """Size in memory."""
+        return prod(self.shape) * np.dtype(self.dtype).itemsize
+
+
+@dataclass(frozen=True, eq=False)
+class StoredArrays(Mapping[str, NDArray[Any]]):
+    """The arrays of a field file by name, each read when first asked for.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    declared : mapping of str to DeclaredArray
+        What the header promised; what is read is held against it.
+    """
+
+    path: Path
+    declared: Mapping[str, DeclaredArray]
+    _read: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._read:
+            self._read[name] = _read_array(self.path, name, self.declared[name])
+        return self._read[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.declared)
+
+    def __len__(self) -> int:
+        return len(self.declared)
+
+    @property
+    def stored_bytes(self) -> dict[str, int]:
+        """Bytes of each array in the file, after packing."""
+        with _archive(self.path) as archive:
+            infos = _members(self.path, archive)
+        return {name: infos[member_name(name)].compress_size for name in self.declared}
+
+
+def member_name(array: str) -> str:
+    """Name of an array's member in the archive."""
+    return f"{array}.npy"
+
+
+def _npy_bytes(name: str, array: NDArray[Any]) -> bytes:
+    """The `.npy` form of an array, little-endian, in C order, filtered."""
+    if name in DELTA_ARRAYS:
+        array = np.diff(array.ravel(), prepend=array.dtype.type(0)).reshape(array.shape)
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, little, version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _header(reflectance_field: ReflectanceField, members: Mapping[str, bytes]) -> bytes:
+    arrays = reflectance_field.arrays
+    header = {
+        "format": FORMAT_NAME,
+        "version": FORMAT_VERSION,
+        # Samples are radiance over facing irradiance: the cosine is in them.
+        "cosine_included": True,
+        "domain": reflectance_field.domain,
+        "visibility": reflectance_field.visibility,
+        "light_model": reflectance_field.light_model,
+        "metadata": reflectance_field.metadata,
+        "arrays": {
+            name: {
+                "dtype": arrays[name].dtype.name,
+                "shape": list(arrays[name].shape),
+                "filter": "delta" if name in DELTA_ARRAYS else "none",
+                "sha256": hashlib.sha256(content).hexdigest(),
+            }
+            for name, content in members.items()
+        },
+    }
+    try:
+        return json.dumps(header, indent=1, sort_keys=True, allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"metadata: expected plain JSON values, received something else ({error})"
+        ) from error
+
+
+def _add(archive: zipfile.ZipFile, name: str, content: bytes, method: int) -> None:
+    info = zipfile.ZipInfo(name, FIXED_TIME)
+    info.compress_type = method
+    info.create_system = 3  # Unix, wherever it is written
+    info.external_attr = 0o644 << 16
+    archive.writestr(info, content, compresslevel=9)
+
+
+@contextmanager
+def _replacing(target: Path) -> Iterator[io.BufferedRandom]:
+    """Yield a new file beside the target; take its place on success, vanish on failure."""
+    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(descriptor, "w+b") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(0o644)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Turn whatever the readers raise into an error that names the file."""
+    try:
+        yield
+    except FieldFileError:
+        raise
+    except FileNotFoundError as error:
+        raise FieldFileError(f"{path}: no such file") from error
+    except zipfile.BadZipFile as error:
+        raise FieldFileError(
+            f"{path}: expected a reflectance field (a ZIP archive), received another or a "
+            f"truncated file ({error})"
+        ) from error
+    except (
+        OSError,
+        EOFError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        zlib.error,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise FieldFileError(
+            f"{path}: damaged reflectance field ({error}); write it again"
+        ) from error
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    with _naming(path), zipfile.ZipFile(path) as archive:
+        yield archive
+
+
+def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """All members by name; exactly those of a field, each once."""
+    infos = archive.infolist()
+    expected = sorted([HEADER, *map(member_name, ARRAYS)])
+    found = sorted(info.filename for info in infos)
+    if found != expected:
+        missing = sorted(set(expected) - set(found))
+        surplus = sorted(set(found) - set(expected))
+        raise FieldFileError(
+            f"{path}: expected the members of a reflectance field, missing: "
+            f"{missing or 'none'}, not known: {surplus[:5] or 'none'}"
+        )
+    return {info.filename: info for info in infos}
+
+
+def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+    if HEADER not in archive.namelist():
+        raise FieldFileError(
+            f"{path}: expected a reflectance field, received a ZIP archive without {HEADER}"
+        )
+    size = archive.getinfo(HEADER).file_size
+    if size > MAX_HEADER_BYTES:
+        raise FieldFileError(
+            f"{path}: {HEADER}: expected at most {MAX_HEADER_BYTES} bytes, received {size}"
+        )
+    header = json.loads(archive.read(HEADER))
+    if not isinstance(header, dict) or header.get("format") != FORMAT_NAME:
+        raise FieldFileError(f"{path}: {HEADER}: expected format {FORMAT_NAME!r}")
+    version = header.get("version")
+    if not isinstance(version, int) or version < 1:
+        raise FieldFileError(f"{path}: version: expected a number, received {version!r}")
+    if version > FORMAT_VERSION:
+        raise FieldFileError(
+            f"{path}: written in version {version} of the format, this program reads up to "
+            f"{FORMAT_VERSION}; install a newer reflfield"
+        )
+    return header
+
+
+def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]:
+    """The header's list of arrays, checked against `model.ARRAYS`."""
+    with _naming(path):
+        declared = {
+            str(name): DeclaredArray(
+                str(entry["dtype"]),
+                tuple(_length(n) for n in entry["shape"]),
+                str(entry["filter"]),
+                str(entry["sha256"]),
+            )
+            for name, entry in header["arrays"].items()
+        }
+        check_arrays({name: (a.dtype, a.shape) for name, a in declared.items()})
+        for name, array in declared.items():
+            if array.filter not in ("none", "delta"):
+                raise ValueError(f"{name}: unknown filter {array.filter!r}")
+        check_options(header["domain"], header["visibility"], header["light_model"])
+    return declared
+
+
+def _length(value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(f"shape: expected numbers >= 0, received {value!r}")
+    return value
+
+
+def _check_size(path: Path, name: str, array: DeclaredArray, info: zipfile.ZipInfo) -> None:
+    """Demand that a member can hold just the array it declares."""
+    surplus = info.file_size - array.n_bytes
+    if not 0 < surplus < NPY_HEADER_BYTES:
+        raise FieldFileError(
+            f"{path}: {name}: expected about {array.n_bytes} bytes for shape "
+            f"{array.shape}, the archive holds {info.file_size}"
+        )
+    if info.file_size > DEFLATE_LIMIT * (info.compress_size + 64):
+        raise FieldFileError(
+            f"{path}: {name}: {info.compress_size} packed bytes cannot hold "
+            f"{info.file_size}; the sizes are forged"
+        )
+
+
+def _read_array(path: Path, name: str, declared: DeclaredArray) -> NDArray[Any]:
+    with _archive(path) as archive:
+        info = archive.getinfo(member_name(name))
+        _check_size(path, name, declared, info)
+        with archive.open(info) as member:
+            # One byte more than promised is enough to notice a false promise.
+            content = member.read(info.file_size + 1)
+        if hashlib.sha256(content).hexdigest() != declared.sha256:
+            raise FieldFileError(
+                f"{path}: {name}: the checksum differs from the header's: the file is "
+                "damaged or was replaced while open"
+            )
+        array = _from_npy(name, content, declared)
+    native = array.astype(array.dtype.newbyteorder("="))
+    if declared.filter == "delta":
+        native = np.cumsum(native.ravel(), dtype=native.dtype).reshape(native.shape)
+    native.setflags(write=False)
+    return native
+
+
+def _from_npy(name: str, content: bytes, declared: DeclaredArray) -> NDArray[Any]:
+    """The array of an `.npy` member; nothing is allocated on the word of its header."""
+    buffer = io.BytesIO(content)
+    if np.lib.format.read_magic(buffer) != (1, 0):
+        raise ValueError(f"{name}: expected .npy version 1.0")
+    shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(buffer)
+    if dtype.name != declared.dtype or shape != declared.shape or in_fortran_order:
+        raise ValueError(
+            f"{name}: expected {declared.dtype} {declared.shape}, received {dtype.name} {shape}"
+        )
+    return np.frombuffer(content, dtype, prod(shape), buffer.tell()).reshape(shape)
+
+
+def _field(
+    header: Mapping[str, Any], declared: Mapping[str, DeclaredArray], arrays: StoredArrays
+) -> ReflectanceField:
+    _, n_view_nodes, n_light_nodes, _ = declared["mean"].shape
+    return ReflectanceField(
+        arrays=arrays,
+        view_side=node_side("mean", n_view_nodes),
+        light_side=node_side("mean", n_light_nodes),
+        domain=header["domain"],
+        visibility=header["visibility"],
+        light_model=header["light_model"],
+        metadata=dict(header["metadata"]),
+    )
+
+
+@dataclass(frozen=True)
+class FieldDescription:
+    """What a field holds, for people.
+
+    Parameters
+    ----------
+    options : dict
+        Domain, visibility, light model.
+    counts : dict of str to int
+        Vertices, faces, texels, clusters, components, grid sides, texture size.
+    memory_bytes, stored_bytes : dict of str to int
+        Size of each array in memory and, for a field opened from a file, in
+        the file.
+    ranges : dict of str to (float, float)
+        Smallest and largest decoded value of each part.
+    metadata : dict
+        As in the field.
+    """
+
+    options: dict[str, str]
+    counts: dict[str, int]
+    memory_bytes: dict[str, int]
+    stored_bytes: dict[str, int]
+    ranges: dict[str, tuple[float, float]]
+    metadata: dict[str, Any]
+
+    def lines(self) -> list[str]:
+        """Return the description as lines of text."""
+        said = [f"{name}: {value}" for name, value in self.options.items()]
+        said += [f"{name}: {value:,}" for name, value in self.counts.items()]
+        said += [f"{n}: {low:.4g} to {high:.4g}" for n, (low, high) in self.ranges.items()]
+        said += [self._size_line(name) for name in self.memory_bytes]
+        said.append(f"total: {_total(self.memory_bytes, self.stored_bytes)}")
+        said += [f"metadata.{name}: {value}" for name, value in self.metadata.items()]
+        return said
+
+    def _size_line(self, name: str) -> str:
+        parts = (
+            {name: d[name]} if name in d else {} for d in (self.memory_bytes, self.stored_bytes)
+        )
+        return f"{name}: {_total(*parts)}"
+
+
+def describe(reflectance_field: ReflectanceField) -> FieldDescription:
+    """Counts, sizes, ranges and options of a field.
+
+    Parameters
+    ----------
+    reflectance_field : ReflectanceField
+        Built or opened. All of its arrays are read, so a damaged file shows.
+
+    Returns
+    -------
+    FieldDescription
+
+    Raises
+    ------
+    FieldFileError
+        If an array of the file is damaged.
+    """
+    f = reflectance_field
+    stored = f.arrays.stored_bytes if isinstance(f.arrays, StoredArrays) else {}
+    height, width = f.texel_of_pixel.shape
+    parts = {
+        "positions": f.positions,
+        "coefficients": f.coefficients,
+        "mean": f.mean,
+        "basis": f.basis,
+    }
+    return FieldDescription(
+        options={
+            "domain": f.domain,
+            "visibility": f.visibility,
+            "light_model": f.light_model,
+        },
+        counts={
+            "vertices": len(f.positions),
+            "faces": len(f.faces),
+            "texels": f.n_texels,
+            "texture_height": height,
+            "texture_width": width,
+            "clusters": f.n_clusters,
+            "components": f.n_components,
+            "view_side": f.view_side,
+            "light_side": f.light_side,
+        },
+        memory_bytes={name: f.arrays[name].nbytes for name in ARRAYS},
+        stored_bytes=stored,
+        ranges={n: (float(a.min()), float(a.max())) for n, a in parts.items() if a.size},
+        metadata=dict(f.metadata),
+    )
+
+
+def _total(memory: Mapping[str, int], stored: Mapping[str, int]) -> str:
+    text = f"{sum(memory.values()):,} bytes"
+    return text + (f", {sum(stored.values()):,} in the file" if stored else "")

@@ -1,0 +1,201 @@
+"""Evaluation against a NumPy form of the formula, and at its edges."""
+
+import numpy as np
+import pytest
+
+from reflfield.errors import InputError, ShapeError
+from reflfield.field.evaluation import (
+    FADE_DEPTH,
+    evaluate,
+    light_response,
+    sum_lights,
+    texel_taps,
+)
+from reflfield.field.synthetic import baked_field, blinn_phong, lambert, square_surface
+from reflfield.sphere.hemisphere import HemisphereGrid
+
+POWER = {"cube_root": 3, "square_root": 2, "linear": 1}
+
+
+def directions(rng, n):
+    d = rng.normal(size=(n, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def share_of_light(z):
+    t = np.clip(1 + z / FADE_DEPTH, 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def evaluate_with_numpy(field, texels, views, lights):
+    """The formula of `field.model`, written out with einsum."""
+    frames = field.local_from_world[texels].astype(float)
+    local_views = np.einsum("nij,nj->ni", frames, views)
+    local_lights = np.einsum("nij,nj->ni", frames, lights)
+    v, v_weights = HemisphereGrid(field.view_side).taps(local_views)
+    l, l_weights = HemisphereGrid(field.light_side).taps(local_lights)  # noqa: E741
+    cluster = field.cluster[texels]
+    taps = (cluster[:, None, None], v[:, :, None], l[:, None, :])
+    means = field.mean[taps]
+    bases = np.moveaxis(field.basis, 1, 3)[taps]
+    nodes = means + np.einsum("nk,nvlkc->nvlc", field.coefficients[texels], bases)
+    value = np.einsum("nv,nl,nvlc->nc", v_weights, l_weights, nodes)
+    sample = np.maximum(value, 0) ** POWER[field.domain]
+    if field.light_side == 1:
+        return sample
+    return sample * share_of_light(local_lights[:, 2:])
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("domain", ["cube_root", "square_root", "linear"])
+@pytest.mark.parametrize(("view_side", "light_side"), [(5, 4), (1, 4), (5, 1), (1, 1), (2, 2)])
+def test_kernel_agrees_with_numpy(domain, view_side, light_side, make_field, rng, rounding):
+    field = make_field(domain=domain, view_side=view_side, light_side=light_side)
+    texels = rng.integers(0, field.n_texels, 500)
+    views, lights = directions(rng, 500), directions(rng, 500)
+    expected = evaluate_with_numpy(field, texels, views, lights)
+    # 16 taps of 5 components in float32, cubed; the taps lose half their digits at
+    # the zenith of a frame (square roots), which 1e-3 of a node spacing covers.
+    scale = np.abs(expected).max()
+    error = np.abs(evaluate(field, texels, views, lights) - expected).max()
+    assert error < rounding(np.float32, operations=80, condition=3, scale=scale) + 1e-4 * scale
+
+
+@pytest.mark.parametrize("n_components", [0, 1, 7])
+def test_any_number_of_components(n_components, make_field, rng):
+    field = make_field(n_components=n_components)
+    texels, views, lights = np.arange(60), directions(rng, 60), directions(rng, 60)
+    expected = evaluate_with_numpy(field, texels, views, lights)
+    assert np.allclose(evaluate(field, texels, views, lights), expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("view_side", "light_side"), [(5, 4), (1, 3), (4, 1)])
+def test_sum_of_lights_equals_single_lights(view_side, light_side, make_field, rng):
+    field = make_field(view_side=view_side, light_side=light_side)
+    texels, views, lights = np.arange(60), directions(rng, 60), directions(rng, 7)
+    irradiances, lit = rng.random((7, 3)), rng.random((60, 7)) < 0.6
+    expected = sum(
+        lit[:, [j]]
+        * irradiances[j]
+        * evaluate(field, texels, views, np.tile(lights[j], (60, 1)))
+        for j in range(7)
+    )
+    summed = sum_lights(field, texels, views, lights, irradiances, lit)
+    assert np.allclose(summed, expected, rtol=1e-4, atol=1e-4)
+    everywhere = sum_lights(field, texels, views, lights, irradiances)
+    assert np.array_equal(
+        everywhere, sum_lights(field, texels, views, lights, irradiances, np.ones_like(lit))
+    )
+
+
+def test_light_response_at_a_node_is_the_sample_there(make_field, rng):
+    field = make_field(domain="linear")
+    views = directions(rng, 60)
+    response = light_response(field, np.arange(60), views)
+    assert response.shape == (60, 9, 3)
+    node = HemisphereGrid(3).directions[4]
+    lights = np.einsum("nij,i->nj", field.local_from_world, node)
+    expected = evaluate(field, np.arange(60), views, lights)
+    assert np.allclose(np.maximum(response[:, 4], 0), expected, atol=2e-3)
+
+
+def test_lambert_square_has_the_textbook_value():
+    field = baked_field(square_surface(2), lambert([0.3, 0.6, 0.9]), light_side=17)
+    tilted = [[np.sin(0.5), 0.0, np.cos(0.5)]]
+    value = evaluate(field, [0], [[0, 0, 1]], tilted)[0]
+    # Bilinear on nodes h = 1/8 apart: the cube root of the cosine, f = (1 - m^2)^(1/3), is
+    # off by h^2/8 |f''| with |f''| < 0.8 here, its cube by 3 times that.
+    assert np.allclose(value, np.array([0.3, 0.6, 0.9]) / np.pi * np.cos(0.5), rtol=5e-3)
+
+
+def test_mirror_direction_is_brightest(rng):
+    field = baked_field(
+        square_surface(1), blinn_phong(0.0, 1.0, 80.0), view_side=33, light_side=33
+    )
+    view = np.array([0.5, 0.2, 0.0])
+    view[2] = np.sqrt(1 - view @ view)
+    lights = np.concatenate([[view * [-1, -1, 1]], directions(rng, 300)])
+    values = evaluate(field, np.zeros(301, int), np.tile(view, (301, 1)), lights)[:, 0]
+    assert np.argmax(values / np.maximum(lights[:, 2], 0.3)) == 0
+
+
+def test_light_fades_out_below_the_horizon():
+    field = baked_field(square_surface(1), lambda v, l: np.ones((len(v), len(l), 3)))  # noqa: E741
+    z = np.linspace(-2 * FADE_DEPTH, FADE_DEPTH, 61)
+    lights = np.stack([np.sqrt(1 - z**2), 0 * z, z], axis=1)
+    values = evaluate(field, np.zeros(61, int), np.tile([[0, 0, 1.0]], (61, 1)), lights)[:, 0]
+    assert np.allclose(values, share_of_light(z), atol=1e-4)  # int16 mean: 1/65534, cubed
+    assert not values[z <= -FADE_DEPTH].any()
+    assert (np.diff(values) >= -1e-6).all()
+
+
+def test_view_below_the_horizon_reads_the_horizon(make_field, rng):
+    field = make_field()
+    frame = field.local_from_world[:1].astype(float)
+    light = frame[:, 2]
+    below, level = np.array([0.6, 0.0, -0.8]) @ frame[0], np.array([1.0, 0, 0]) @ frame[0]
+    assert np.allclose(
+        evaluate(field, [0], below[None], light),
+        evaluate(field, [0], level[None], light),
+        rtol=1e-4,
+    )
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1.0, 1e12])
+@pytest.mark.parametrize("domain", ["cube_root", "linear"])
+def test_scale_of_the_samples_carries_through(scale, domain):
+    field = baked_field(square_surface(1), lambert(scale * np.pi), domain=domain)
+    value = evaluate(field, [0], [[0, 0, 1]], [[0, 0, 1]])
+    assert np.allclose(value, scale, rtol=1e-3, atol=0)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(
+    "light", [[1, 0, 0], [0, 0, 1], [0, 0, -1], [0, 1, 1e-30], [1e-20, 0, 1], [0, 1, -1e-9]]
+)
+def test_poles_and_horizon_are_finite(light, make_field):
+    field = make_field()
+    for direction in (light, field.local_from_world[0].T @ np.array(light, np.float32)):
+        values = evaluate(field, [0], [direction], [direction])
+        assert np.isfinite(values).all()
+        assert (values >= 0).all()
+
+
+def test_absent_texels_are_black_and_others_refused(make_field):
+    field, up = make_field(), [[0, 0, 1.0]]
+    assert not evaluate(field, [-1], up, up).any()
+    assert not light_response(field, [-1], up).any()
+    with pytest.raises(InputError, match="texels: expected -1 to 59, received 60 to 60"):
+        evaluate(field, [60], up, up)
+    with pytest.raises(ShapeError, match="lights_world"):
+        evaluate(field, [0], up, [[0, 1]])
+    with pytest.raises(ShapeError, match="lit"):
+        sum_lights(field, [0], up, up, [[1, 1, 1]], np.ones((2, 1), bool))
+
+
+def test_taps_interpolate_texel_coordinates(rng):
+    field = baked_field(square_surface(8), lambert(0.5))
+    inside = (0.5 + 7 * rng.random((200, 2))) / 8
+    texels, weights = texel_taps(field, inside)
+    row, column = np.divmod(texels, 8)
+    assert np.allclose((weights * (column + 0.5)).sum(1) / 8, inside[:, 0], atol=1e-6)
+    assert np.allclose(1 - (weights * (row + 0.5)).sum(1) / 8, inside[:, 1], atol=1e-6)
+
+
+def test_taps_leave_out_absent_texels(make_field, rng):
+    field = make_field()
+    inside = (0.5 + rng.random((500, 2)) * (11, 8)) / (12, 9)
+    texels, weights = texel_taps(field, inside)
+    assert not weights[texels < 0].any()
+    exists = (texels >= 0).any(axis=1)
+    total = weights.sum(axis=1)
+    assert np.allclose(total[exists], 1, atol=1e-6)
+    assert not total[~exists].any()
+
+
+def test_taps_of_a_single_pixel():
+    field = baked_field(square_surface(1), lambert(0.5))
+    texels, weights = texel_taps(field, [[0.0, 0.0], [0.7, 1.0]])
+    assert not texels.any()
+    assert np.allclose(weights.sum(1), 1)

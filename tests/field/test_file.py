@@ -1,0 +1,238 @@
+"""The field file: identity, same bytes, laziness, and everything that is refused."""
+
+import hashlib
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from reflfield.errors import FieldFileError, InputError
+from reflfield.field import file as field_file
+from reflfield.field.evaluation import evaluate
+from reflfield.field.file import FORMAT_VERSION, describe, open_field, write_field
+from reflfield.field.model import ARRAYS
+from reflfield.field.synthetic import baked_field, lambert, square_surface
+
+
+@pytest.fixture
+def field(make_field):
+    return make_field(metadata={"options": {"clusters": 3}, "name": "vase"})
+
+
+@pytest.fixture
+def path(tmp_path, field):
+    write_field(tmp_path / "field.rfld", field)
+    return tmp_path / "field.rfld"
+
+
+def rewrite(path, change):
+    """Write the archive anew after `change` of its {name: bytes}."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def edit_header(path, change):
+    def edit(members):
+        header = json.loads(members["header.json"])
+        change(header)
+        members["header.json"] = json.dumps(header).encode()
+
+    rewrite(path, edit)
+
+
+def replace_array(path, name, content):
+    """Put other bytes in place of a member, with the checksum to match."""
+
+    def edit(members):
+        members[f"{name}.npy"] = content
+        header = json.loads(members["header.json"])
+        header["arrays"][name]["sha256"] = hashlib.sha256(content).hexdigest()
+        members["header.json"] = json.dumps(header).encode()
+
+    rewrite(path, edit)
+
+
+@pytest.mark.parametrize("n_components", [0, 4])
+@pytest.mark.parametrize("kind", ["int8", "float16"])
+def test_save_and_load_is_identity(n_components, kind, make_field, tmp_path, rng):
+    bits = field_file_quantisation(kind)
+    field = make_field(n_components=n_components, quantisation=bits, metadata={"a": [1, "b"]})
+    write_field(tmp_path / "f.rfld", field)
+    opened = open_field(tmp_path / "f.rfld")
+    for name in ARRAYS:
+        assert opened.arrays[name].dtype == field.arrays[name].dtype
+        assert np.array_equal(opened.arrays[name], field.arrays[name]), name
+    for name in ("view_side", "light_side", "domain", "visibility", "light_model", "metadata"):
+        assert getattr(opened, name) == getattr(field, name)
+    up = np.tile([[0.0, 0.0, 1.0]], (60, 1))
+    values = [evaluate(f, np.arange(60), up, up) for f in (field, opened)]
+    assert np.array_equal(*values)
+
+
+def field_file_quantisation(kind):
+    from reflfield.field.model import Quantisation
+
+    return Quantisation(coefficients=kind, basis=kind, mean=kind)
+
+
+def test_equal_fields_give_equal_bytes(field, path, tmp_path):
+    write_field(tmp_path / "again.rfld", open_field(path))
+    assert (tmp_path / "again.rfld").read_bytes() == path.read_bytes()
+
+
+def test_opening_reads_no_array_until_it_is_used(path, monkeypatch):
+    read = []
+    original = field_file._read_array
+    monkeypatch.setattr(
+        field_file, "_read_array", lambda p, name, d: read.append(name) or original(p, name, d)
+    )
+    opened = open_field(path)
+    assert read == []
+    _ = (opened.n_clusters, opened.n_clusters)
+    assert read == ["mean_scale"]
+
+
+def test_writing_leaves_nothing_behind_when_it_fails(tmp_path, path, field):
+    before = path.read_bytes()
+    bad = baked_field(square_surface(1), lambert(0.5), metadata={"when": object()})
+    with pytest.raises(InputError, match="metadata: expected plain JSON"):
+        write_field(path, bad)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["field.rfld"]
+
+
+def test_missing_file_and_other_files_are_refused(tmp_path, path):
+    with pytest.raises(FieldFileError, match=r"none.rfld: no such file"):
+        open_field(tmp_path / "none.rfld")
+    text = tmp_path / "text.rfld"
+    text.write_text("no field")
+    with pytest.raises(FieldFileError, match=r"text.rfld: expected a reflectance field"):
+        open_field(text)
+    with zipfile.ZipFile(tmp_path / "other.rfld", "w") as archive:
+        archive.writestr("a.txt", "b")
+    with pytest.raises(FieldFileError, match=r"a ZIP archive without header.json"):
+        open_field(tmp_path / "other.rfld")
+    with pytest.raises(FieldFileError, match="damaged"):
+        open_field(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_truncated_files_are_refused(path, share):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(FieldFileError, match=r"field.rfld: "):
+        open_field(path)
+
+
+def test_any_flipped_byte_is_noticed_or_harmless(path, field, rng):
+    content = path.read_bytes()
+    for position in rng.integers(0, len(content), 60):
+        damaged = bytearray(content)
+        damaged[position] ^= 0x5A
+        path.write_bytes(bytes(damaged))
+        try:
+            opened = open_field(path)
+            arrays = {name: opened.arrays[name] for name in ARRAYS}
+        except FieldFileError:
+            continue
+        # Padding of the archive's own records may change without an effect.
+        assert all(np.array_equal(arrays[name], field.arrays[name]) for name in ARRAYS)
+
+
+def test_newer_versions_are_refused(path):
+    edit_header(path, lambda header: header.update(version=FORMAT_VERSION + 1))
+    with pytest.raises(FieldFileError, match=r"version 2 of the format.*install a newer"):
+        open_field(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda h: h.update(format="other"), "expected format 'reflfield-field'"),
+        (lambda h: h.update(version="1"), "version: expected a number"),
+        (lambda h: h.update(domain="log"), "domain: expected one of"),
+        (lambda h: h.pop("domain"), "damaged reflectance field"),
+        (lambda h: h["arrays"].pop("uv"), "arrays: expected"),
+        (lambda h: h["arrays"]["uv"].update(dtype="object"), "uv: expected dtype float32"),
+        (lambda h: h["arrays"]["uv"].update(shape=[5, 3]), "uv: expected shape"),
+        (lambda h: h["arrays"]["faces"].update(shape=[-7, 3]), "shape: expected numbers >= 0"),
+        (lambda h: h["arrays"]["faces"].update(shape=[10**15, 3]), "faces: expected about"),
+        (lambda h: h["arrays"]["faces"].update(filter="x"), "unknown filter"),
+        (lambda h: h["arrays"]["faces"].update(sha256="0"), "faces: the checksum differs"),
+        (lambda h: h.update(arrays=[1]), "damaged reflectance field"),
+    ],
+)
+def test_bad_headers_are_refused(path, change, text):
+    edit_header(path, change)
+    with pytest.raises(FieldFileError, match=text):
+        _ = open_field(path).faces
+
+
+def test_missing_and_surplus_members_are_refused(path):
+    rewrite(path, lambda members: members.update({"../../evil.py": b"x"}))
+    with pytest.raises(FieldFileError, match=r"not known: \['../../evil.py'\]"):
+        open_field(path)
+    rewrite(path, lambda members: (members.pop("../../evil.py"), members.pop("uv.npy")))
+    with pytest.raises(FieldFileError, match=r"missing: \['uv.npy'\]"):
+        open_field(path)
+
+
+def test_pickles_and_foreign_arrays_are_refused(path):
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([{"a": 1}] * 7, dtype=object), allow_pickle=True)
+    replace_array(path, "faces", buffer.getvalue())
+    with pytest.raises(FieldFileError, match=r"faces"):
+        _ = open_field(path).faces
+
+
+def test_hostile_array_headers_allocate_nothing(path, field):
+    text = b"{'descr': '<i4', 'fortran_order': False, 'shape': (10000000000000, 3), }"
+    text += b" " * (117 - len(text)) + b"\n"
+    header = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+    replace_array(path, "faces", header + field.faces.tobytes())
+    with pytest.raises(FieldFileError, match=r"received int32 \(10000000000000, 3\)"):
+        _ = open_field(path).faces
+
+
+def test_bombs_are_refused_before_they_are_unpacked(tmp_path):
+    # 40 MB of zeros in 40 kB: allowed only as far as the caller says.
+    field = baked_field(square_surface(1), lambert(0.0), view_side=61, light_side=41)
+    write_field(tmp_path / "bomb.rfld", field)
+    with pytest.raises(FieldFileError, match="expected arrays of at most 1000000 bytes"):
+        open_field(tmp_path / "bomb.rfld", max_bytes=1_000_000)
+
+
+def test_indices_out_of_range_are_refused(path, field):
+    buffer = io.BytesIO()
+    np.save(buffer, np.full_like(field.cluster, 200, dtype=np.uint8))
+    replace_array(path, "cluster", buffer.getvalue())
+    with pytest.raises(InputError, match="cluster: expected indices from 0 to 2"):
+        _ = open_field(path).cluster
+
+
+def test_index_arrays_pack_well(tmp_path):
+    field = baked_field(square_surface(256), lambert(0.5))
+    write_field(tmp_path / "f.rfld", field)
+    stored = open_field(tmp_path / "f.rfld").arrays.stored_bytes
+    # 262 kB of running numbers; differences of 1 deflate to next to nothing.
+    assert stored["texel_of_pixel"] < 2000
+
+
+def test_description_names_counts_sizes_and_options(path, field):
+    described = describe(open_field(path))
+    assert described.counts["texels"] == 60
+    assert described.counts["components"] == 4
+    assert described.options["domain"] == "cube_root"
+    assert described.memory_bytes["basis"] == field.basis.size
+    assert sum(described.stored_bytes.values()) < path.stat().st_size
+    assert described.ranges["mean"] == (field.mean.min(), field.mean.max())
+    text = "\n".join(described.lines())
+    for part in ("texels: 60", "domain: cube_root", "basis:", "in the file", "metadata.name"):
+        assert part in text
+    assert describe(field).stored_bytes == {}
