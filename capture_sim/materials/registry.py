@@ -62,6 +62,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "alpha_x": 0.45,
         "alpha_y": 0.12,
     },
+    "gold": {"type": "ggx", "metal": "gold", "alpha": 0.2},
     "gold_leaf": {
         "type": "textured",
         "base": {"type": "ggx", "metal": "gold", "alpha": 0.22},
@@ -128,7 +129,7 @@ def material_presets() -> dict[str, dict[str, Any]]:
 
 
 def make_material(
-    table: Table, *, folder: Path = Path(), what: str = "material", depth: int = 0
+    table: Table, folder: Path = Path(), *, what: str = "material", depth: int = 0
 ) -> Material:
     """Build a material from a TOML table.
 
