@@ -1,15 +1,273 @@
-"""Silhouettes made from photographs where none are given."""
+"""Silhouettes made from photographs, where none are given.
+
+A backdrop shows at the border of the image. Where the border is of one colour (black cloth,
+a lit wall), the object is what differs from it; otherwise OpenCV's GrabCut separates what
+the border shows from the rest. Both work on the mean of a view's photographs: a part in
+shadow under one light is lit under another, and noise averages out.
+
+A silhouette that misses part of the object carves that part off the hull for good, one that
+is a little too large does not: dark parts in doubt are kept, small holes are filled.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.images import encode_srgb
+from reflfield.errors import CaptureError, InputError
+
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SilhouetteOptions:
+    """How silhouettes are made. Lengths are fractions of the longer image side.
+
+    Parameters
+    ----------
+    border : float
+        Width of the frame whose pixels stand for the backdrop.
+    uniform_spread : float
+        The backdrop counts as uniform if nine tenths of the border differ from its median
+        colour by less than this (sRGB-encoded, in [0, 1]).
+    least_contrast : float
+        Difference from the backdrop (encoded) below which nothing is object.
+    margin : float
+        Distance from what is certainly object beyond which all is backdrop.
+    closing : float
+        Gaps up to about this width, dark creases mostly, are closed.
+    smallest_part, smallest_hole : float
+        Parts and holes with a smaller share of the object's area are dropped and filled.
+    soft_edge : float
+        Width of the band beside the outline in which coverage may lie between 0 and 1.
+    grabcut_iterations : int
+        Iterations of GrabCut.
+    grabcut_size : int
+        GrabCut works on an image with at most this longer side, pixels.
+    """
+
+    border: float = 0.015
+    uniform_spread: float = 0.25
+    least_contrast: float = 0.1
+    margin: float = 0.015
+    closing: float = 0.025
+    smallest_part: float = 0.05
+    smallest_hole: float = 0.01
+    soft_edge: float = 0.006
+    grabcut_iterations: int = 6
+    grabcut_size: int = 512
+
 
 def silhouette_from_photographs(
-    photographs: Iterable[NDArray[np.float32]], *, name: str = "view"
-) -> NDArray[np.float32]:
-    """Coverage (h, w) in [0, 1] of the object in one view's photographs (h, w, 3)."""
-    raise NotImplementedError(name)
+    photographs: Iterable[Float32],
+    options: SilhouetteOptions | None = None,
+    *,
+    name: str = "view",
+) -> Float32:
+    """Coverage of the object in the photographs of one view.
+
+    Parameters
+    ----------
+    photographs : iterable of (h, w, 3) float32
+        Linear photographs of one view, one per light; taken one at a time.
+    options : SilhouetteOptions, optional
+        Thresholds.
+    name : str
+        Named in errors.
+
+    Returns
+    -------
+    (h, w) float32
+        Coverage in [0, 1], anti-aliased along the outline.
+
+    Raises
+    ------
+    CaptureError
+        If no object is found.
+    InputError
+        If there are no photographs or their sizes differ.
+
+    Examples
+    --------
+    A bright square on black:
+
+    >>> photograph = np.zeros((40, 40, 3), np.float32)
+    >>> photograph[10:30, 10:30] = 0.5
+    >>> coverage = silhouette_from_photographs([photograph])
+    >>> round(float(coverage.sum()))
+    400
+    """
+    options = options or SilhouetteOptions()
+    image = _exposed(_mean(photographs, name))
+    encoded = encode_srgb(image)
+    border = _border(image.shape[0], image.shape[1], options.border)
+    backdrop = np.median(encoded[border], axis=0)
+    difference = np.abs(encoded - backdrop).max(axis=2)
+    uniform = np.quantile(difference[border], 0.9) < options.uniform_spread
+    if uniform:
+        inside = _differs_from_backdrop(difference, options)
+    else:
+        inside = _grabcut(encoded, border, options)
+    inside = _cleaned(inside, options)
+    share = float(inside.mean())
+    if not 0.0005 < share < 0.995:
+        raise CaptureError(
+            f"{name}: expected an object before a backdrop, found one that covers "
+            f"{100 * share:.2f} % of the image: empty silhouette; give a silhouette per view"
+        )
+    if not uniform:
+        return _smoothed(inside)
+    linear_backdrop = np.median(image[border], axis=0)
+    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), inside, options)
+
+
+def _mean(photographs: Iterable[Float32], name: str) -> Float32:
+    """Mean of the photographs, one in memory at a time."""
+    total, count = None, 0
+    for photograph in photographs:
+        if total is not None and total.shape != photograph.shape:
+            raise InputError(
+                f"{name}: expected photographs of one size, received {total.shape} and "
+                f"{photograph.shape}"
+            )
+        total = photograph.astype(np.float64) if total is None else total + photograph
+        count += 1
+    if total is None:
+        raise InputError(f"{name}: expected photographs or a silhouette file, received neither")
+    return (total / count).astype(np.float32)
+
+
+def _exposed(image: Float32) -> Float32:
+    """Scaled so that its brightest pixels, outliers aside, are 1."""
+    white = float(np.quantile(image.max(axis=2), 0.995))
+    return image / np.float32(white) if white > 0 else image
+
+
+def _border(height: int, width: int, fraction: float) -> Bool:
+    """True in a frame along the edge of the image."""
+    n = max(2, round(fraction * max(height, width)))
+    border = np.ones((height, width), dtype=bool)
+    border[n:-n, n:-n] = False
+    return border
+
+
+def _differs_from_backdrop(difference: Float32, options: SilhouetteOptions) -> Bool:
+    """Pixels that differ from the backdrop, or differ a little and touch such ones.
+
+    The strong threshold is Otsu's; the weak one lies just above what the backdrop varies by
+    at some distance from the strong pixels.
+    """
+    levels = np.clip(difference * 255, 0, 255).astype(np.uint8)
+    otsu = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0] / 255
+    strong = max(otsu, options.least_contrast)
+    n = max(3, round(options.margin * max(difference.shape)))
+    near = cv2.dilate((difference > strong).astype(np.uint8), _disc(n))
+    far = difference[near == 0]
+    variation = float(np.quantile(far, 0.99)) if far.size else 0.0
+    weak = float(np.clip(1.25 * variation, options.least_contrast, 0.75 * strong))
+    smooth = cv2.GaussianBlur(difference, (0, 0), 0.7)
+    reached = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
+    return _touching((smooth > weak) & reached, smooth > strong)
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    element: NDArray[np.uint8] = cv2.getStructuringElement(
+        cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)
+    )
+    return element
+
+
+def _touching(candidates: Bool, seeds: Bool) -> Bool:
+    """Connected parts of `candidates` that hold a seed."""
+    _, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=4)
+    kept = np.zeros(labels.max() + 1, dtype=bool)
+    kept[np.unique(labels[seeds & candidates])] = True
+    kept[0] = False
+    return kept[labels]
+
+
+def _grabcut(encoded: Float32, border: Bool, options: SilhouetteOptions) -> Bool:
+    """Object by GrabCut, seeded with the border as backdrop."""
+    height, width = border.shape
+    scale = min(1.0, options.grabcut_size / max(height, width))
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    small = cv2.resize((encoded * 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+    labels = np.full(small.shape[:2], cv2.GC_PR_FGD, dtype=np.uint8)
+    labels[_border(size[1], size[0], max(options.border, 0.03))] = cv2.GC_BGD
+    cv2.setRNGSeed(0)  # its k-means draws from OpenCV's global generator
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(small, labels, None, *models, options.grabcut_iterations, cv2.GC_INIT_WITH_MASK)
+    inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.float32)
+    return cv2.resize(inside, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+def _cleaned(inside: Bool, options: SilhouetteOptions) -> Bool:
+    """Gaps closed, crumbs dropped, small holes filled."""
+    n = max(1, round(options.closing * max(inside.shape) / 2))
+    disc = _disc(n)
+    padded = np.pad(inside.astype(np.uint8), 2 * n, mode="edge")
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)
+    closed = closed[2 * n : -2 * n, 2 * n : -2 * n] > 0
+    parts = _large_parts(closed, options.smallest_part)
+    holes = ~parts
+    return ~_large_holes(holes, options.smallest_hole * parts.sum())
+
+
+def _large_parts(inside: Bool, smallest_share: float) -> Bool:
+    """Connected parts whose area is at least a share of the largest one's."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        inside.astype(np.uint8), connectivity=8
+    )
+    if count == 1:
+        return inside
+    area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    area[0] = 0
+    kept: Bool = area >= max(smallest_share * area.max(), 1)
+    return kept[labels]
+
+
+def _large_holes(outside: Bool, smallest_area: float) -> Bool:
+    """The outside without holes smaller than an area; what touches the border stays."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        outside.astype(np.uint8), connectivity=4
+    )
+    kept: Bool = stats[:, cv2.CC_STAT_AREA] >= smallest_area
+    edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    kept[edge] = True
+    kept[0] = False
+    return kept[labels]
+
+
+def _smoothed(inside: Bool) -> Float32:
+    """Coverage of an outline that is only known to the pixel."""
+    return np.clip(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.8), 0, 1)
+
+
+def _soft_edged(difference: Float32, inside: Bool, options: SilhouetteOptions) -> Float32:
+    r"""Coverage along the outline, from how far each pixel is on its way to the object.
+
+    A pixel that the object covers by :math:`\alpha` differs from the backdrop by
+    :math:`\alpha` times what the object does, in linear light. The object's own difference
+    is taken from just inside the outline. Where the object itself is dark there, the ratio
+    means nothing and the plain outline is kept.
+    """
+    n = max(2, round(options.soft_edge * max(inside.shape)))
+    disc = _disc(n)
+    solid = inside.astype(np.uint8)
+    padded = cv2.copyMakeBorder(solid, n, n, n, n, cv2.BORDER_REPLICATE)
+    core = cv2.erode(padded, disc)[n:-n, n:-n] > 0
+    reach = _disc(2 * n).astype(np.float32)
+    weight = cv2.filter2D(core.astype(np.float32), -1, reach)
+    total = cv2.filter2D(np.where(core, difference, 0), -1, reach)
+    object_difference = total / np.maximum(weight, 1)
+    trusted = (weight >= 1) & (object_difference > 0.02)
+    ratio = np.clip(difference / np.maximum(object_difference, 1e-6), 0, 1)
+    band = (cv2.dilate(solid, disc) > 0) & ~core
+    plain = _smoothed(inside)
+    return np.where(band & trusted, ratio, plain).astype(np.float32)
