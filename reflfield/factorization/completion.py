@@ -209,7 +209,7 @@ def complete(
     best: Fit | None = None
     for attempt in range(restarts + 1):
         order_rng = np.random.default_rng([seed, attempt])
-        fit = _fit(reader, rank, passes, block, centred, order_rng)
+        fit = fit_map(reader, rank, passes, block, centred, order_rng)
         if best is None or fit.residuals[-1] < best.residuals[-1]:
             best = fit
         if _settled(fit.residuals):
@@ -229,7 +229,7 @@ def _settled(residuals: tuple[float, ...]) -> bool:
     return len(residuals) < 3 or residuals[-1] > 0.9 * residuals[-2]
 
 
-def _fit(
+def fit_map(
     reader: Reader,
     rank: int,
     passes: int,
@@ -244,14 +244,14 @@ def _fit(
         order = shuffled_columns(reader.source, rng)
         if model is None:
             model = _start(reader, order, rank, block, centred, rng)
-        model, statistics = _pass(reader, model, order, block, online=number == 0)
+        model, statistics = one_pass(reader, model, order, block, online=number == 0)
         model = resolve_final(with_moments(model, statistics), statistics)
         residuals.append(statistics.residual)
     assert model is not None
     return Fit(model, tuple(residuals))
 
 
-def _pass(
+def one_pass(
     reader: Reader, model: Model, order: Columns, block: int, *, online: bool
 ) -> tuple[Model, RowStatistics]:
     """Sum the statistics of all columns; `online` solves the rows after every block."""
@@ -343,30 +343,37 @@ def leading_vectors(
 # --- finish -----------------------------------------------------------------------------
 
 
-def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
-    """Read all columns once more for coefficients and flags; back to the caller's unit."""
-    model, scale, dtype = fit.model, reader.scale, reader.dtype
+def map_coefficients(
+    reader: Reader, model: Model, block: int
+) -> tuple[NDArray[np.floating], NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients about the prior mean, coverage of columns, and total weight of samples."""
     n_rows, n_columns = reader.source.shape
-    coefficients = np.zeros((n_columns, model.rank), dtype=dtype)
+    coefficients = np.zeros((n_columns, model.rank), dtype=reader.dtype)
     coverage = np.zeros(n_columns)
-    row_weight = np.zeros(n_rows // model.n_channels)
+    sample_weight = np.zeros(n_rows // model.n_channels)
     gram = gram_of_samples(model.basis, model.n_channels)
     for columns in blocks_of(np.arange(n_columns), block):
         data = reader.block(columns)
-        step = infer(model, data, gram).mean - model.prior_mean
-        coefficients[columns] = step * scale
+        coefficients[columns] = infer(model, data, gram).mean - model.prior_mean
         coverage[columns] = data.coverage
-        row_weight += data.weights.sum(axis=1)
+        sample_weight += data.weights.sum(axis=1)
+    return coefficients, coverage, sample_weight
+
+
+def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
+    """Read all columns once more for coefficients and flags; back to the caller's unit."""
+    model, scale, dtype = fit.model, reader.scale, reader.dtype
+    coefficients, coverage, sample_weight = map_coefficients(reader, model, block)
     mean = model.offset + model.basis @ model.prior_mean
     return Completion(
         basis=model.basis,
-        coefficients=coefficients,
+        coefficients=coefficients * dtype.type(scale),
         mean=(mean * scale).astype(dtype),
         noise=float(np.sqrt(model.noise) * scale),
         residuals=tuple(residual * scale for residual in fit.residuals),
         coverage=coverage.astype(np.float32),
         empty_columns=coverage == 0,
         sparse_columns=coverage < LEAST_COVERAGE,
-        empty_rows=np.repeat(row_weight == 0, model.n_channels),
+        empty_rows=np.repeat(sample_weight == 0, model.n_channels),
         restarts=restarts,
     )

@@ -267,6 +267,8 @@ def with_moments(model: Model, statistics: RowStatistics) -> Model:
 
 def floored(covariance: Array) -> Array:
     """Symmetric matrix whose eigenvalues are at least `COVARIANCE_FLOOR` of the largest."""
+    if covariance.size == 0:
+        return covariance
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     values = np.maximum(values, COVARIANCE_FLOOR * max(values[-1], 1e-300))
     return (vectors * values) @ vectors.T
@@ -293,6 +295,14 @@ def resolve_final(model: Model, statistics: RowStatistics) -> Model:
     return orthonormal(model, *split_rows(model, rows))
 
 
+def resolve_towards(model: Model, statistics: RowStatistics, pseudo: float) -> Model:
+    """Rows solved with `pseudo` observations of what they were; basis orthonormal."""
+    strength = pseudo * regular(statistics.mean_second_moment)
+    return orthonormal(
+        model, *split_rows(model, statistics.solve_rows(join_rows(model), strength))
+    )
+
+
 def regular(matrix: Array) -> Array:
     """Positive definite by a ridge of 1e-9 of the mean diagonal."""
     return matrix + (1e-9 * np.trace(matrix) / len(matrix) + 1e-300) * np.eye(len(matrix))
@@ -300,6 +310,8 @@ def regular(matrix: Array) -> Array:
 
 def orthonormal(model: Model, offset: Array, basis: Array) -> Model:
     """Same model in coordinates where U^T U = I and E[z z^T] is diagonal, descending."""
+    if model.rank == 0:
+        return replace(model, offset=offset.astype(model.offset.dtype))
     q, r = np.linalg.qr(basis)
     if model.centred:
         offset = offset + basis @ model.prior_mean
