@@ -1,0 +1,122 @@
+"""The command `capture-sim`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from capture_sim.dome import rig_presets
+from capture_sim.errors import SceneError
+from capture_sim.materials import material_presets
+from capture_sim.objects import object_presets
+from capture_sim.plan import plan as make_plan
+from capture_sim.scene import load_scene, shipped_scenes
+from capture_sim.write import write_capture
+
+app = typer.Typer(
+    help="Simulate photographs of an object in a dome of cameras and lights.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneArgument = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A TOML file, or the name of a shipped scene.")
+]
+
+
+@app.command()
+def render(
+    scene: SceneArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the capture.")],
+    workers: Annotated[int, typer.Option(min=1, help="Views rendered at the same time.")] = min(
+        os.cpu_count() or 1, 8
+    ),
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier capture in the folder.")
+    ] = False,
+) -> None:
+    """Simulate a capture: photographs, silhouettes, calibration and truth."""
+    with _progress_bar() as bar:
+        task = bar.add_task("views", total=None)
+        write_capture(
+            load_scene(scene),
+            output,
+            workers=workers,
+            overwrite=overwrite,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    _console().print(f"Wrote {output}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def plan(scene: SceneArgument) -> None:
+    """Show what would be simulated, why, and its cost, without doing it."""
+    for line in make_plan(load_scene(scene)).lines():
+        _console().print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+@app.command()
+def presets() -> None:
+    """List the rigs, objects, materials and scenes that scene files can name."""
+    for title, entries in (
+        ("scenes", shipped_scenes()),
+        ("objects", object_presets()),
+        ("materials", material_presets()),
+        ("rigs", rig_presets()),
+    ):
+        _console().print(_preset_table(title, entries))
+
+
+def _preset_table(title: str, entries: Mapping[str, Any]) -> Table:
+    table = Table(title=title, title_justify="left", show_header=False, box=None)
+    for name, entry in entries.items():
+        table.add_row(name, entry if isinstance(entry, str) else _one_line(entry))
+    return table
+
+
+def _one_line(preset: Mapping[str, Any]) -> str:
+    """The plain settings of a preset; nested tables by their keys."""
+    return ", ".join(
+        f"{key} = ..." if isinstance(value, dict) else f"{key} = {value}"
+        for key, value in preset.items()
+        if not (isinstance(value, list) and value and isinstance(value[0], dict))
+    )
+
+
+def _progress_bar() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+
+
+def _console() -> Console:
+    return Console()
+
+
+def main() -> None:
+    """Run the command; scenes that cannot be simulated end with status 2."""
+    try:
+        app()
+    except SceneError as error:
+        print(f"capture-sim: {error}", file=sys.stderr)
+        sys.exit(2)

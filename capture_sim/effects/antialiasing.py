@@ -1,0 +1,99 @@
+"""Several rays per pixel, more of them where an outline crosses the pixel.
+
+Inside the object shading changes slowly over a pixel and a small regular grid
+of rays is enough; at its outline and at inner occlusion edges a finer grid
+measures how much of the pixel each side takes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture_sim.effects import Cost, Workload
+from capture_sim.scene import Scene
+
+NAME = "anti-aliasing"
+
+
+def needed(scene: Scene) -> tuple[bool, str]:
+    """Tell whether pixels are sampled by more than one ray.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is to be simulated.
+
+    Returns
+    -------
+    simulated : bool
+    reason : str
+    """
+    inside, edge = scene.image.samples_per_side, scene.image.edge_samples_per_side
+    if max(inside, edge) == 1:
+        return False, "one ray per pixel was asked for"
+    return True, f"{inside} x {inside} rays inside the object, {edge} x {edge} at outlines"
+
+
+def cost(scene: Scene, work: Workload) -> Cost:
+    """Every pixel is searched for outlines with the finer grid."""
+    return Cost(rays=work.n_pixels * scene.image.edge_samples_per_side**2 + work.n_points)
+
+
+def sub_pixel_grid(samples_per_side: int) -> NDArray[np.float64]:
+    """Centres of a regular division of the unit pixel.
+
+    Parameters
+    ----------
+    samples_per_side : int
+        Rays along each side of the pixel.
+
+    Returns
+    -------
+    (samples_per_side**2, 2) float64
+        Columns x, y in (0, 1).
+
+    Examples
+    --------
+    >>> sub_pixel_grid(2)
+    array([[0.25, 0.25],
+           [0.75, 0.25],
+           [0.25, 0.75],
+           [0.75, 0.75]])
+    """
+    ticks = (np.arange(samples_per_side) + 0.5) / samples_per_side
+    y, x = np.meshgrid(ticks, ticks, indexing="ij")
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def crossed_by_outline(
+    face: NDArray[np.int64], distance: NDArray[np.float32], step: float
+) -> NDArray[np.bool_]:
+    """Find pixels that hold an outline, from their grid of rays.
+
+    Parameters
+    ----------
+    face : (n_pixels, n_rays) int
+        Triangle hit by each ray, -1 for none.
+    distance : (n_pixels, n_rays) float
+        Along the rays, metres; infinite for none.
+    step : float
+        Change of distance within a pixel that counts as an edge, metres.
+
+    Returns
+    -------
+    (n_pixels,) bool
+        True where rays both hit and miss, or distances jump.
+
+    Examples
+    --------
+    >>> face = np.array([[3, 3], [3, -1], [-1, -1]])
+    >>> distance = np.array([[1.0, 1.01], [1.0, np.inf], [np.inf, np.inf]], np.float32)
+    >>> crossed_by_outline(face, distance, step=0.1)
+    array([False,  True, False])
+    """
+    hit = face >= 0
+    partly = hit.any(axis=1) & ~hit.all(axis=1)
+    finite = np.where(hit, distance, 0.0)
+    jumps = hit.all(axis=1) & (np.ptp(finite, axis=1) > step)
+    return partly | jumps

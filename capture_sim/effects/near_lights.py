@@ -1,0 +1,143 @@
+r"""Lights at a finite distance: direction and irradiance vary over the object.
+
+A point light of intensity :math:`I` (W/sr) at distance :math:`d` gives a
+surface that faces it the irradiance :math:`I / d^2`. Directional lights have
+one direction and irradiance everywhere. The beam of a spot light falls off as
+:math:`\cos^p` of the angle to its axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture_sim.effects import Cost, Workload
+from capture_sim.errors import SceneError
+from capture_sim.scene import Scene
+
+NAME = "near lights"
+
+Array = NDArray[np.float64]
+
+_FAR = 1e3  # metres to a stand-in for a light at infinity; only shadow rays use it
+
+
+def needed(scene: Scene) -> tuple[bool, str]:
+    """Tell whether any light is at a finite distance.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is to be simulated.
+
+    Returns
+    -------
+    simulated : bool
+    reason : str
+    """
+    near = sum(light["type"] != "directional" for light in scene.lights)
+    if near == 0:
+        return False, "all lights are directional: one direction and irradiance everywhere"
+    return True, f"{near} of {len(scene.lights)} lights stand at a finite distance"
+
+
+def cost(scene: Scene, work: Workload) -> Cost:
+    """One direction and inverse square for each point and light."""
+    return Cost(operations=work.n_points * work.n_lights if needed(scene)[0] else 0)
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Light that arrives at points of the surface.
+
+    Attributes
+    ----------
+    directions : (n, n_lights, 3) float64
+        Unit, towards the light.
+    irradiance : (n, n_lights, 3) float64
+        Of a surface that faces the light.
+    targets : (n, n_lights, 3) float64
+        Where shadow rays end.
+    """
+
+    directions: Array
+    irradiance: Array
+    targets: Array
+
+
+def illuminate(lights: tuple[Mapping[str, Any], ...], points: Array) -> Illumination:
+    """Direction and facing irradiance of every light at every point.
+
+    Parameters
+    ----------
+    lights : tuple of dict
+        Lights of the native capture format: `point`, `directional` or `spot`
+        with an exponent.
+    points : (n, 3) float
+        World, metres.
+
+    Returns
+    -------
+    Illumination
+
+    Raises
+    ------
+    SceneError
+        If a light is of another type.
+
+    Examples
+    --------
+    Twice as far gives a quarter:
+
+    >>> light = {"id": "l0", "type": "point", "position": [0, 0, 2], "intensity": [8, 8, 8]}
+    >>> arriving = illuminate((light,), np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -2.0]]))
+    >>> arriving.irradiance[:, 0, 0]
+    array([2. , 0.5])
+    """
+    parts = [_one_light(light, points) for light in lights]
+    return Illumination(*(np.stack(part, axis=1) for part in zip(*parts, strict=True)))
+
+
+def _one_light(light: Mapping[str, Any], points: Array) -> tuple[Array, Array, Array]:
+    if light["type"] == "directional":
+        return _distant(light, points)
+    if light["type"] not in ("point", "spot"):
+        raise SceneError(
+            f"light {light['id']!r}: type: expected point, directional or spot, "
+            f"received {light['type']!r}; use one that the simulator knows"
+        )
+    position = np.asarray(light["position"], dtype=np.float64)
+    offsets = position - points
+    squared = np.einsum("nc,nc->n", offsets, offsets)[:, None]
+    directions = offsets / np.sqrt(squared)
+    irradiance = np.asarray(light["intensity"], dtype=np.float64) / squared
+    if light["type"] == "spot":
+        irradiance = irradiance * _beam(light, directions)[:, None]
+    return directions, irradiance, np.broadcast_to(position, points.shape)
+
+
+def _distant(light: Mapping[str, Any], points: Array) -> tuple[Array, Array, Array]:
+    direction = np.asarray(light["direction"], dtype=np.float64)
+    direction = direction / np.linalg.norm(direction)
+    irradiance = np.asarray(light["irradiance"], dtype=np.float64)
+    return (
+        np.broadcast_to(direction, points.shape),
+        np.broadcast_to(irradiance, points.shape),
+        points + _FAR * direction,
+    )
+
+
+def _beam(light: Mapping[str, Any], directions: Array) -> Array:
+    """Fall-off of a spot light towards the points; (n,)."""
+    if "exponent" not in light:
+        raise SceneError(
+            f"light {light['id']!r}: exponent: expected a number, received nothing; "
+            "spot lights are simulated with a cosine-power beam"
+        )
+    axis = np.asarray(light["direction"], dtype=np.float64)
+    cosine = -directions @ (axis / np.linalg.norm(axis))
+    return np.asarray(np.maximum(cosine, 0.0) ** float(light["exponent"]))

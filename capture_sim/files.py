@@ -1,0 +1,107 @@
+"""Files whose bytes depend on their contents alone."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+from PIL import Image
+
+from capture_sim.objects import SurfaceMesh
+
+_LARGEST_HALF = float(np.finfo(np.float16).max)
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # zip members carry a date; this is the earliest
+
+
+def write_exr(path: Path, radiance: NDArray[np.float32]) -> None:
+    """Write linear radiance as half floats; as floats if it exceeds their range.
+
+    Parameters
+    ----------
+    path : Path
+    radiance : (h, w, 3) float32
+    """
+    fits = float(np.abs(radiance).max(initial=0.0)) <= _LARGEST_HALF
+    pixels = np.ascontiguousarray(radiance, dtype=np.float16 if fits else np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": pixels}) as file:
+        file.write(str(path))
+
+
+def write_silhouette(path: Path, coverage: NDArray[np.float32]) -> None:
+    """Write coverage in [0, 1] as an 8-bit grey PNG, white = object.
+
+    Parameters
+    ----------
+    path : Path
+    coverage : (h, w) float32
+    """
+    grey = np.rint(coverage * 255.0).astype(np.uint8)
+    Image.fromarray(grey).save(path, format="PNG")
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON types with the keys in their given order.
+
+    Parameters
+    ----------
+    path : Path
+    content : mapping
+    """
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays as a compressed npz without pickles or dates.
+
+    Parameters
+    ----------
+    path : Path
+    arrays : mapping of str to array
+        Of numbers or booleans.
+
+    Raises
+    ------
+    ValueError
+        If an array holds Python objects.
+    """
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, np.asarray(array, order="C"), allow_pickle=False)
+            member = zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH)
+            member.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(member, buffer.getvalue(), compresslevel=4)
+
+
+def write_ply(path: Path, mesh: SurfaceMesh) -> None:
+    """Write a mesh with normals and texture coordinates as binary PLY.
+
+    Parameters
+    ----------
+    path : Path
+    mesh : SurfaceMesh
+        Written as float32, metres.
+    """
+    names = ("x", "y", "z", "nx", "ny", "nz", "s", "t")
+    vertices = np.hstack([mesh.vertices, mesh.normals, mesh.uv]).astype("<f4")
+    faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in names),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    text = "\n".join(header) + "\n"
+    path.write_bytes(text.encode("ascii") + vertices.tobytes() + faces.tobytes())

@@ -1,0 +1,217 @@
+"""Which effects a scene calls for, why, and what the rendering will cost.
+
+Costs are measured, not guessed: a few views are traced, a few lights shaded
+and one photograph written, and the times and sizes scaled to the whole.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+
+from capture_sim.effects import (
+    Cost,
+    Workload,
+    antialiasing,
+    interreflection,
+    near_lights,
+    sensor_noise,
+    shadows,
+)
+from capture_sim.effects.near_lights import illuminate
+from capture_sim.files import write_exr
+from capture_sim.rays import RayTracer
+from capture_sim.render import ViewSamples, sample_view, shade
+from capture_sim.scene import Scene
+from capture_sim.truth import write_view_truth
+
+EFFECTS = (antialiasing, near_lights, shadows, sensor_noise, interreflection)
+
+# Enough to average over near and far sides of the object, few enough to take no time.
+TRIAL_VIEWS = 3
+TRIAL_LIGHTS = 6
+
+Table = Mapping[str, Any]
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class PlannedEffect:
+    """Decision about one effect.
+
+    Attributes
+    ----------
+    name : str
+    simulated : bool
+    reason : str
+    cost : Cost
+        What it adds to the rendering.
+    """
+
+    name: str
+    simulated: bool
+    reason: str
+    cost: Cost
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What will be simulated, and its cost.
+
+    Attributes
+    ----------
+    scene : str
+        Name of the scene.
+    work : Workload
+        Counts; those of points and lit pairs are estimates.
+    effects : tuple of PlannedEffect
+    seconds : float
+        Estimated time of one worker on this machine.
+    bytes : int
+        Estimated size of the capture.
+    """
+
+    scene: str
+    work: Workload
+    effects: tuple[PlannedEffect, ...]
+    seconds: float
+    bytes: int
+
+    @property
+    def rays(self) -> int:
+        """Rays of all effects."""
+        return sum(effect.cost.rays for effect in self.effects)
+
+    def lines(self) -> list[str]:
+        """Describe the plan, one fact a line."""
+        work = self.work
+        counts = [
+            f"scene        {self.scene}",
+            f"photographs  {work.n_photographs} ({work.n_views} views, {work.n_lights} lights)",
+            f"rays         {self.rays / 1e6:.1f} million",
+            f"shading      {work.n_lit / 1e6:.1f} million lit pairs of point and light",
+            f"time         about {_seconds_text(self.seconds)} on one worker",
+            f"size         about {self.bytes / 1e6:.1f} MB",
+            "effects",
+        ]
+        return counts + [
+            f"  {'yes' if effect.simulated else 'no ':3}  {effect.name:16} {effect.reason}"
+            for effect in self.effects
+        ]
+
+
+def _seconds_text(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+def plan(scene: Scene) -> Plan:
+    """Decide on the effects of a scene and estimate its cost on this machine.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    Plan
+        Its times depend on how busy the machine is.
+    """
+    tracer = RayTracer(scene.mesh)
+    trial = _run_trial(scene, tracer)
+    n_views, n_lights = len(scene.cameras), len(scene.lights)
+    points = trial.points_per_view * n_views
+    work = Workload(
+        n_views=n_views,
+        n_lights=n_lights,
+        n_pixels=sum(int(camera["w"]) * int(camera["h"]) for camera in scene.cameras),
+        n_points=int(points),
+        n_lit=int(points * n_lights * trial.lit_fraction),
+    )
+    frames = work.n_photographs + scene.heldout_frames
+    abrdf_bytes = 4 * scene.truth.points * work.n_photographs  # deflated to a third
+    return Plan(
+        scene=scene.name,
+        work=work,
+        effects=tuple(_decided(effect, scene, work) for effect in EFFECTS),
+        seconds=n_views * trial.view_seconds + frames * trial.photograph_seconds,
+        bytes=int(n_views * trial.view_bytes + frames * trial.photograph_bytes) + abrdf_bytes,
+    )
+
+
+def _decided(effect: ModuleType, scene: Scene, work: Workload) -> PlannedEffect:
+    simulated, reason = effect.needed(scene)
+    return PlannedEffect(effect.NAME, simulated, reason, effect.cost(scene, work))
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Means over a few views and lights."""
+
+    points_per_view: float
+    lit_fraction: float
+    view_seconds: float
+    view_bytes: float
+    photograph_seconds: float
+    photograph_bytes: float
+
+
+def _run_trial(scene: Scene, tracer: RayTracer) -> _Trial:
+    cameras = _spread(len(scene.cameras), TRIAL_VIEWS)
+    lights = tuple(scene.lights[i] for i in _spread(len(scene.lights), TRIAL_LIGHTS))
+    measured = [_one_view(scene, tracer, camera, lights) for camera in cameras]
+    return _Trial(*(float(column) for column in np.mean(measured, axis=0)))
+
+
+def _one_view(
+    scene: Scene, tracer: RayTracer, camera: int, lights: tuple[Table, ...]
+) -> tuple[float, ...]:
+    """Points, lit part, seconds and bytes of a view, and of a photograph."""
+    view, view_seconds = _timed(lambda: sample_view(scene, tracer, scene.cameras[camera]))
+    images, shade_seconds = _timed(lambda: shade(scene, tracer, view, lights))
+    with tempfile.TemporaryDirectory() as folder:
+        sample = Path(folder) / "sample.exr"
+        brightest = images[np.argmax(images.sum(axis=(1, 2, 3)))]
+        _, write_seconds = _timed(lambda: write_exr(sample, brightest))
+        size, truth_bytes, truth_seconds = sample.stat().st_size, 0, 0.0
+        if scene.truth.per_view:
+            identity = scene.cameras[camera]
+            _, truth_seconds = _timed(
+                lambda: write_view_truth(scene, tracer, identity, Path(folder))
+            )
+            truth_bytes = (Path(folder) / f"truth/views/{identity['id']}.npz").stat().st_size
+    return (
+        len(view.points),
+        _lit_fraction(view, lights),
+        view_seconds + truth_seconds,
+        truth_bytes,
+        shade_seconds / len(lights) + write_seconds,
+        size,
+    )
+
+
+def _lit_fraction(view: ViewSamples, lights: tuple[Table, ...]) -> float:
+    """Part of the pairs of point and light with the light above the horizon."""
+    points = view.points[:: max(1, len(view.points) // 4096)]
+    if len(points) == 0:
+        return 0.0
+    directions = illuminate(lights, points.position).directions
+    cosine = np.einsum("nlj,nj->nl", directions, points.shading_from_world[:, 2])
+    return float((cosine > 0.0).mean())
+
+
+def _spread(count: int, wanted: int) -> list[int]:
+    """Up to `wanted` indices spread over ``range(count)``."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(wanted, count))})
+
+
+def _timed(work: Callable[[], Result]) -> tuple[Result, float]:
+    start = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - start

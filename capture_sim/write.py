@@ -1,0 +1,182 @@
+"""The native capture directory, version 1.
+
+Everything goes to a hidden folder beside the target, which is renamed when
+complete: a capture is either there and whole, or not there.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from capture_sim.effects import sensor_noise
+from capture_sim.errors import scene_error
+from capture_sim.files import write_exr, write_json, write_silhouette
+from capture_sim.rays import RayTracer
+from capture_sim.render import render_view, sample_view
+from capture_sim.scene import Scene
+from capture_sim.truth import write_truth, write_view_truth
+
+GENERATOR = "capture_sim"
+CAPTURE_FILE = "capture.json"
+
+# (views done, views in all); called once more for the truth that is not per view.
+Progress = Callable[[int, int], None]
+
+
+def write_capture(
+    scene: Scene,
+    folder: Path,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Simulate a scene and write its photographs and truth.
+
+    Parameters
+    ----------
+    scene : Scene
+        What to simulate.
+    folder : Path
+        Written as a whole at the end; the bytes do not depend on `workers`.
+    workers : int
+        Views rendered at the same time.
+    overwrite : bool
+        True to replace an earlier capture there; anything else is kept.
+    progress : callable, optional
+        Called with the steps done and their total number.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    SceneError
+        If the folder exists and may not be replaced.
+    """
+    check_target(folder, overwrite=overwrite)
+    part = folder.parent / f".{folder.name}.incomplete"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        _fill(scene, part, workers, progress or (lambda done, total: None))
+        _move_into_place(part, folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return folder
+
+
+def check_target(folder: Path, *, overwrite: bool) -> None:
+    """Refuse a folder that may not be written.
+
+    Parameters
+    ----------
+    folder : Path
+        Where a capture is to go.
+    overwrite : bool
+        True if an earlier capture may be replaced.
+
+    Raises
+    ------
+    SceneError
+        If there is a file, a folder that holds something else, or a capture
+        that may not be replaced.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise scene_error(str(folder), "a folder or nothing", "a file", "choose another place")
+    if (folder / CAPTURE_FILE).is_file():
+        if not overwrite:
+            raise scene_error(
+                str(folder), "no capture there yet", "one", "pass --overwrite to replace it"
+            )
+    elif any(folder.iterdir()):
+        raise scene_error(
+            str(folder),
+            "an empty folder or an earlier capture",
+            f"a folder without {CAPTURE_FILE}",
+            "choose another place; it is not deleted",
+        )
+
+
+def _move_into_place(part: Path, folder: Path) -> None:
+    if not folder.exists():
+        part.rename(folder)
+        return
+    old = folder.parent / f".{folder.name}.replaced"
+    shutil.rmtree(old, ignore_errors=True)
+    folder.rename(old)
+    part.rename(folder)
+    shutil.rmtree(old)
+
+
+def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
+    tracer = RayTracer(scene.mesh, n_threads=1 if workers > 1 else 0)
+    for name in ("photographs", "silhouettes"):
+        (folder / name).mkdir()
+    steps = len(scene.cameras) + 1
+    progress(0, steps)
+    with ThreadPoolExecutor(workers) as pool:
+        views = range(len(scene.cameras))
+        futures = [pool.submit(_write_view, scene, tracer, view, folder) for view in views]
+        try:
+            for done, future in enumerate(as_completed(futures), start=1):
+                future.result()
+                progress(done, steps)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    write_truth(scene, tracer, folder)
+    write_json(folder / CAPTURE_FILE, capture_description(scene))
+    progress(steps, steps)
+
+
+def _write_view(scene: Scene, tracer: RayTracer, index: int, folder: Path) -> None:
+    camera = scene.cameras[index]
+    view = sample_view(scene, tracer, camera)
+    write_silhouette(folder / _silhouette(camera), view.coverage)
+    noise = scene.effects.sensor_noise
+    for light, radiance in render_view(scene, tracer, view):
+        if noise is not None:
+            radiance = sensor_noise.add_noise(radiance, noise, (scene.seed, index, light))
+        name = f"{camera['id']}_{scene.lights[light]['id']}.exr"
+        write_exr(folder / "photographs" / name, radiance)
+    if scene.truth.per_view:
+        write_view_truth(scene, tracer, camera, folder)
+
+
+def _silhouette(camera: Mapping[str, Any]) -> str:
+    return f"silhouettes/{camera['id']}.png"
+
+
+def capture_description(scene: Scene) -> dict[str, Any]:
+    """Contents of `capture.json`.
+
+    Parameters
+    ----------
+    scene : Scene
+        What was simulated.
+
+    Returns
+    -------
+    dict
+        Of JSON types, in the order in which it is written.
+    """
+    return {
+        "format": "reflfield-capture",
+        "version": 1,
+        "name": scene.name,
+        "generator": GENERATOR,
+        "base_geometry": scene.base_geometry,
+        "cameras": [{**camera, "silhouette": _silhouette(camera)} for camera in scene.cameras],
+        "lights": [dict(light) for light in scene.lights],
+        "photographs": {"pattern": "photographs/{camera}_{light}.exr"},
+        "truth": "truth/truth.json",
+    }
