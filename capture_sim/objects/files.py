@@ -1,0 +1,168 @@
+"""Objects from mesh files, with the normals and tangents that they lack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from capture_sim.errors import scene_error
+from capture_sim.objects.mesh import Array, Faces, SurfaceMesh, unit, without_slivers
+from capture_sim.tables import TableReader
+
+MOST_FACES = 20_000_000
+
+
+def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
+    """Mesh file, turned, centred, scaled and moved."""
+    path = reader.file("file", folder)
+    vertices, faces, uv, normals = read_mesh(path)
+    rotation = Rotation.from_euler(
+        "xyz", reader.vector("rotation_deg", (0, 0, 0)), degrees=True
+    )
+    vertices = rotation.apply(vertices)
+    if reader.flag("centre", True):
+        vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    extent = float(np.ptp(vertices, axis=0).max())
+    scale = reader.number("scale", 1.0, low=1e-9, high=1e9)
+    size = reader.number("size", extent * scale, low=1e-9, high=1e9)
+    vertices = vertices * (size / extent) + reader.vector("position", (0, 0, 0))
+    turned = None if normals is None else rotation.apply(normals)
+    return finish_mesh(vertices, faces, uv, turned, path.name)
+
+
+def read_mesh(path: Path) -> tuple[Array, Faces, Array | None, Array | None]:
+    """Vertices, faces, texture coordinates and normals of a mesh file.
+
+    Parameters
+    ----------
+    path : Path
+        OBJ, PLY, STL, OFF or glTF file.
+
+    Returns
+    -------
+    vertices : (n, 3) float64
+    faces : (m, 3) int32
+    uv : (n, 2) float64 or None
+    normals : (n, 3) float64 or None
+        None where the file holds none.
+
+    Raises
+    ------
+    SceneError
+        If the file cannot be read, is empty, or holds values that are not finite.
+    """
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+    except Exception as error:  # trimesh raises whatever its parsers meet
+        raise scene_error(
+            str(path), "a mesh file", f"{type(error).__name__}: {error}"
+        ) from error
+    vertices = np.array(mesh.vertices, np.float64).reshape(-1, 3)
+    faces = np.array(mesh.faces, np.int64).reshape(-1, 3)
+    if not 0 < len(faces) <= MOST_FACES:
+        raise scene_error(str(path), f"1 to {MOST_FACES} triangles", len(faces))
+    inside = (faces >= 0).all() and (faces < len(vertices)).all()
+    if not inside or not np.isfinite(vertices).all() or not np.ptp(vertices):
+        raise scene_error(str(path), "finite vertices and faces among them", "others")
+    uv = getattr(mesh.visual, "uv", None)
+    normals = mesh.vertex_normals if "vertex_normals" in mesh._cache.cache else None
+    return (
+        vertices,
+        faces.astype(np.int32),
+        _rows_or_none(uv, len(vertices), 2),
+        _rows_or_none(normals, len(vertices), 3),
+    )
+
+
+def _rows_or_none(values: Any, n_rows: int, n_columns: int) -> Array | None:
+    if values is None:
+        return None
+    array = np.array(values, np.float64)
+    usable = array.shape == (n_rows, n_columns) and np.isfinite(array).all()
+    return array if usable else None
+
+
+def finish_mesh(
+    vertices: Array, faces: Faces, uv: Array | None, normals: Array | None, name: str
+) -> SurfaceMesh:
+    """Mesh with the smooth normals and tangents it lacks.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float64
+        Metres.
+    faces : (m, 3) int32
+        Counter-clockwise seen from outside.
+    uv : (n, 2) float64, optional
+        Texture coordinates.
+    normals : (n, 3) float64, optional
+        Smooth normals; by angle-weighted mean of the faces if not given, over all
+        vertices in one place (seams of the coordinates stay smooth).
+    name : str
+        Name of the mesh.
+
+    Returns
+    -------
+    SurfaceMesh
+
+    Examples
+    --------
+    >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    >>> flat = finish_mesh(corners, np.array([[0, 1, 2]], np.int32), corners[:, :2], None, "a")
+    >>> flat.normals[0], flat.tangents[0]
+    (array([0., 0., 1.]), array([1., 0., 0.]))
+    """
+    faces = without_slivers(vertices, faces)
+    smooth = unit(_smooth_normals(vertices, faces) if normals is None else normals)
+    smooth[np.linalg.norm(smooth, axis=1) < 0.5] = [0.0, 0.0, 1.0]  # vertices of no face
+    has_uv = uv is not None
+    coordinates = np.zeros((len(vertices), 2)) if uv is None else uv
+    return SurfaceMesh(
+        vertices=vertices,
+        faces=faces,
+        uv=coordinates,
+        normals=smooth,
+        tangents=_tangents(vertices, faces, coordinates, smooth),
+        has_uv=has_uv,
+        name=name,
+    )
+
+
+def _smooth_normals(vertices: Array, faces: Faces) -> Array:
+    """Angle-weighted normals, shared by vertices in one place; (n, 3)."""
+    size = np.ptp(vertices, axis=0).max()
+    _, place = np.unique(np.round(vertices / (1e-7 * size)), axis=0, return_inverse=True)
+    corners = vertices[faces]
+    ahead = unit(np.roll(corners, -1, axis=1) - corners)
+    back = unit(np.roll(corners, 1, axis=1) - corners)
+    angle = np.arccos(np.clip(np.sum(ahead * back, axis=2), -1.0, 1.0))
+    normal = unit(np.cross(ahead[:, 0], back[:, 0]))
+    return _scatter(place.ravel()[faces], normal[:, None] * angle[..., None])[place.ravel()]
+
+
+def _tangents(vertices: Array, faces: Faces, uv: Array, normals: Array) -> Array:
+    """Area-weighted dP/du made orthogonal to the normals; any direction without it."""
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    steps = uv[faces[:, 1:]] - uv[faces[:, :1]]
+    determinant = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 1, 0] * steps[:, 0, 1]
+    rise = edges[:, 0] * steps[:, 1, 1:] - edges[:, 1] * steps[:, 0, 1:]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1, keepdims=True)
+    per_face = unit(rise) * np.sign(determinant)[:, None] * area
+    total = _scatter(faces, np.repeat(per_face[:, None], 3, axis=1), len(vertices))
+    tangents = total - np.sum(total * normals, axis=1, keepdims=True) * normals
+    lost = np.linalg.norm(tangents, axis=1) <= 1e-6 * np.linalg.norm(total, axis=1)
+    away = np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)]
+    tangents[lost] = np.cross(away, normals[lost])
+    return unit(tangents)
+
+
+def _scatter(index: NDArray[np.int_] | Faces, values: Array, n_rows: int = 0) -> Array:
+    """Sum of `values` (m, 3, 3) over equal entries of `index` (m, 3)."""
+    flat, n_rows = index.ravel(), max(n_rows, int(index.max()) + 1)
+    columns = values.reshape(-1, 3).T
+    return np.stack([np.bincount(flat, c, n_rows) for c in columns], axis=1)
