@@ -12,12 +12,16 @@ from reflfield.capture.cameras import Camera
 # Calibrated rigs stand on an axis of their world; a mean this close to one means that axis.
 SNAP_ANGLE = np.radians(20.0)
 
-# Below this mean length the cameras' up directions cancel: they agree on nothing.
-LEAST_AGREEMENT = 0.2
+# Mean length of the cameras' up directions below which they do not tell (cameras that lie on
+# their side or hang upside down). Over a whole upper hemisphere it is pi / 4.
+LEAST_AGREEMENT = 0.5
 
 
 def estimated_up(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """Mean of the cameras' up directions, snapped to a world axis it nearly is.
+
+    Where the cameras lie on their side or hang upside down, so that their up directions
+    cancel, it is the axis of the ring they stand on, on the side they look down from.
 
     Parameters
     ----------
@@ -27,7 +31,7 @@ def estimated_up(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     Returns
     -------
     (3,) float64
-        Unit world direction; +Z where the cameras disagree.
+        Unit world direction; +Z where nothing tells.
 
     Examples
     --------
@@ -38,12 +42,28 @@ def estimated_up(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """
     mean = np.mean([camera.up for camera in cameras], axis=0)
     length = float(np.linalg.norm(mean))
-    if length < LEAST_AGREEMENT:
+    if length >= LEAST_AGREEMENT:
+        return _snapped(mean / length)
+    return _snapped(_ring_axis(cameras))
+
+
+def _ring_axis(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """Direction in which the camera positions vary least, against the cameras' gaze."""
+    centres = np.array([camera.centre for camera in cameras])
+    centred = centres - centres.mean(axis=0)
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    gaze = np.mean([camera.forward for camera in cameras], axis=0)
+    if len(spread) < 3 or not spread[1] > 0:  # fewer than three cameras, or all in a line
         return np.array([0.0, 0.0, 1.0])
-    mean = mean / length
-    axis = int(np.argmax(np.abs(mean)))
-    if abs(mean[axis]) < np.cos(SNAP_ANGLE):
-        return mean
+    axis: NDArray[np.float64] = axes[2]
+    return -axis if axis @ gaze > 0 else axis
+
+
+def _snapped(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The nearest world axis if it is near."""
+    axis = int(np.argmax(np.abs(direction)))
+    if abs(direction[axis]) < np.cos(SNAP_ANGLE):
+        return direction
     snapped = np.zeros(3)
-    snapped[axis] = np.sign(mean[axis])
+    snapped[axis] = np.sign(direction[axis])
     return snapped

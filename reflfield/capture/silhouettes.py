@@ -40,8 +40,11 @@ class SilhouetteOptions:
         Difference from the backdrop (encoded) below which nothing is object.
     margin : float
         Distance from what is certainly object beyond which all is backdrop.
+    crack : float
+        Gaps up to this width do not part the object.
     closing : float
-        Gaps up to about this width, dark creases mostly, are closed.
+        Notches in the outline up to this width are filled: mostly parts in cast shadow, as
+        dark as the backdrop. Holes are left as they are.
     smallest_part, smallest_hole : float
         Parts and holes with a smaller share of the object's area are dropped and filled.
     soft_edge : float
@@ -56,10 +59,11 @@ class SilhouetteOptions:
     uniform_spread: float = 0.25
     least_contrast: float = 0.1
     margin: float = 0.015
-    closing: float = 0.025
+    crack: float = 0.02
+    closing: float = 0.036
     smallest_part: float = 0.05
-    smallest_hole: float = 0.01
-    soft_edge: float = 0.006
+    smallest_hole: float = 0.015
+    soft_edge: float = 0.003
     grabcut_iterations: int = 6
     grabcut_size: int = 512
 
@@ -114,7 +118,7 @@ def silhouette_from_photographs(
         inside = _differs_from_backdrop(difference, options)
     else:
         inside = _grabcut(encoded, border, options)
-    inside = _cleaned(inside, options)
+    seen, inside = inside, _cleaned(inside, options)
     share = float(inside.mean())
     if not 0.0005 < share < 0.995:
         raise CaptureError(
@@ -124,7 +128,7 @@ def silhouette_from_photographs(
     if not uniform:
         return _smoothed(inside)
     linear_backdrop = np.median(image[border], axis=0)
-    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), inside, options)
+    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), seen, inside, options)
 
 
 def _mean(photographs: Iterable[Float32], name: str) -> Float32:
@@ -208,15 +212,22 @@ def _grabcut(encoded: Float32, border: Bool, options: SilhouetteOptions) -> Bool
 
 
 def _cleaned(inside: Bool, options: SilhouetteOptions) -> Bool:
-    """Gaps closed, crumbs dropped, small holes filled."""
-    n = max(1, round(options.closing * max(inside.shape) / 2))
-    disc = _disc(n)
-    padded = np.pad(inside.astype(np.uint8), 2 * n, mode="edge")
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)
-    closed = closed[2 * n : -2 * n, 2 * n : -2 * n] > 0
-    parts = _large_parts(closed, options.smallest_part)
-    holes = ~parts
-    return ~_large_holes(holes, options.smallest_hole * parts.sum())
+    """Gaps closed, crumbs dropped, small holes filled; large holes keep their shape."""
+    longer = max(inside.shape)
+    joined = _closed(inside, max(1, round(options.crack * longer / 2)))
+    parts = _large_parts(joined, options.smallest_part)
+    solid = ~_large_holes(~parts, float("inf"))
+    least = options.smallest_hole * float(parts.sum())
+    holes = _large_holes(solid & ~parts, least)
+    bridged = _closed(solid, max(1, round(options.closing * longer / 2)))
+    return ~_large_holes(~bridged, least) & ~holes
+
+
+def _closed(inside: Bool, radius: int) -> Bool:
+    """Morphological closing; the object continues beyond the border of the image."""
+    padded = np.pad(inside.astype(np.uint8), 2 * radius, mode="edge")
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(radius))
+    return closed[2 * radius : -2 * radius, 2 * radius : -2 * radius] > 0
 
 
 def _large_parts(inside: Bool, smallest_share: float) -> Bool:
@@ -240,7 +251,7 @@ def _large_holes(outside: Bool, smallest_area: float) -> Bool:
     kept: Bool = stats[:, cv2.CC_STAT_AREA] >= smallest_area
     edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     kept[edge] = True
-    kept[0] = False
+    kept[0] = False  # label 0 is the object itself
     return kept[labels]
 
 
@@ -249,13 +260,15 @@ def _smoothed(inside: Bool) -> Float32:
     return np.clip(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.8), 0, 1)
 
 
-def _soft_edged(difference: Float32, inside: Bool, options: SilhouetteOptions) -> Float32:
+def _soft_edged(
+    difference: Float32, seen: Bool, inside: Bool, options: SilhouetteOptions
+) -> Float32:
     r"""Coverage along the outline, from how far each pixel is on its way to the object.
 
     A pixel that the object covers by :math:`\alpha` differs from the backdrop by
     :math:`\alpha` times what the object does, in linear light. The object's own difference
-    is taken from just inside the outline. Where the object itself is dark there, the ratio
-    means nothing and the plain outline is kept.
+    is taken from just inside the outline. Where the object itself is dark there, or was
+    filled in without being seen, the ratio means nothing and the plain outline is kept.
     """
     n = max(2, round(options.soft_edge * max(inside.shape)))
     disc = _disc(n)
@@ -266,7 +279,8 @@ def _soft_edged(difference: Float32, inside: Bool, options: SilhouetteOptions) -
     weight = cv2.filter2D(core.astype(np.float32), -1, reach)
     total = cv2.filter2D(np.where(core, difference, 0), -1, reach)
     object_difference = total / np.maximum(weight, 1)
-    trusted = (weight >= 1) & (object_difference > 0.02)
+    filled = cv2.dilate((inside & ~seen).astype(np.uint8), _disc(1)) > 0
+    trusted = (weight >= 1) & (object_difference > 0.02) & ~filled
     ratio = np.clip(difference / np.maximum(object_difference, 1e-6), 0, 1)
     band = (cv2.dilate(solid, disc) > 0) & ~core
     plain = _smoothed(inside)
