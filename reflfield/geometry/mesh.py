@@ -137,10 +137,12 @@ class Mesh:
         """Length of the diagonal of the bounding box, metres."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
 
-    @property
+    @cached_property
     def watertight(self) -> bool:
         """True if every edge joins exactly two faces of opposite direction."""
-        return len(self.faces) > 0 and open_edge_count(self) == 0
+        forward, backward = (np.sort(keys) for keys in _edge_keys(self))
+        once = (np.diff(forward) > 0).all()
+        return len(self.faces) > 0 and bool(once) and np.array_equal(forward, backward)
 
     @cached_property
     def _doubled_area_vectors(self) -> Array:
@@ -188,14 +190,19 @@ def open_edge_count(mesh: Mesh) -> int:
     >>> open_edge_count(Mesh([[0, 0, 0], [2, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
     3
     """
+    forward, backward = _edge_keys(mesh)
+    keys, uses = np.unique(forward, return_counts=True)
+    used_once = keys[uses == 1]
+    paired = np.isin(backward, used_once) & np.isin(forward, used_once)
+    return int(np.count_nonzero(~paired))
+
+
+def _edge_keys(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """One number for each directed edge, and that of the opposite edge; (3 m,) each."""
     start = mesh.faces.ravel().astype(np.int64)
     end = np.roll(mesh.faces, -1, axis=1).ravel().astype(np.int64)
     n = len(mesh.vertices)
-    forward, uses = np.unique(start * n + end, return_counts=True)
-    paired = np.isin(end * n + start, forward[uses == 1]) & np.isin(
-        start * n + end, forward[uses == 1]
-    )
-    return int(np.count_nonzero(~paired))
+    return start * n + end, end * n + start
 
 
 def without_unused_vertices(mesh: Mesh) -> Mesh:

@@ -165,6 +165,22 @@ class RayScene:
         answer = self._rays_blocked(rays, lengths)
         return answer & (limit > 0.0)
 
+    def pixel_depths(self, camera: Camera, pixels: ArrayLike) -> Array:
+        """Distance (n,) to the surface along the rays of pixels (n, 2).
+
+        Metres along the ray from the camera; for an orthographic camera from a common
+        plane before the mesh. inf where the ray misses or the lens has no ray.
+        """
+        origins, directions = camera.rays(pixels)
+        if camera.kind == "orthographic":
+            # Parallel rays have no start of their own: begin before the whole mesh.
+            ahead = (self._origin - origins) @ camera.forward
+            origins = origins + np.outer(ahead - self._scale, camera.forward)
+        usable = np.isfinite(directions).all(axis=1)
+        depth = np.full(len(origins), np.inf)
+        depth[usable] = self.first_hit(origins[usable], directions[usable])[0]
+        return depth
+
     def inside(self, points: ArrayLike) -> Bools:
         """True for points (n, 3) enclosed by a watertight mesh; never for an open one."""
         array = np.asarray(points, dtype=np.float64)
@@ -439,16 +455,7 @@ def _camera_distances(camera: Camera, points: Array) -> Array:
 
 def _depth_map(scene: RayScene, camera: Camera) -> Array:
     """Distance to the surface along the ray of each pixel centre; inf where it misses."""
-    row, col = np.mgrid[: camera.height, : camera.width]
-    centres = np.stack([col.ravel(), row.ravel()], axis=1) + 0.5
-    origins, directions = camera.rays(centres)
-    if camera.kind == "orthographic":
-        # Parallel rays have no start of their own: begin before the whole mesh.
-        ahead = (scene.mesh.bounds.mean(axis=0) - origins) @ camera.forward
-        origins = origins + np.outer(ahead - scene.diagonal, camera.forward)
-    usable = np.isfinite(directions).all(axis=1)
-    depth = np.full(len(centres), np.inf)
-    depth[usable] = scene.first_hit(origins[usable], directions[usable])[0]
+    depth = scene.pixel_depths(camera, camera.pixel_centres())
     return depth.reshape(camera.height, camera.width)
 
 
