@@ -39,6 +39,9 @@ RIGID_TOLERANCE = 1e-3
 NEWTON_STEPS = 30
 # Residual, in normalised image coordinates, at which a pixel counts as inverted.
 NEWTON_TOLERANCE = 1e-9
+# Leading coefficients below this change nothing within any field of view, but upset the
+# search for roots.
+NEGLIGIBLE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,8 +298,8 @@ def undistort(distorted: Array, distortion: tuple[float, ...]) -> Array:
     array([[1., 0.]])
     """
     limit = largest_radius(distortion)
-    ideal = distorted * np.minimum(1.0, 0.9 * limit / _radii(distorted))[:, None]
     with np.errstate(all="ignore"):
+        ideal = distorted * np.minimum(1.0, 0.9 * limit / _radii(distorted))[:, None]
         for _ in range(NEWTON_STEPS):
             residual = distort(ideal, distortion) - distorted
             if not np.max(np.abs(residual), initial=0.0) > NEWTON_TOLERANCE**2:
@@ -328,7 +331,9 @@ def largest_radius(distortion: tuple[float, ...]) -> float:
     square = np.polynomial.Polynomial([0.0, 1.0])
     slope = (numerator + 2 * square * numerator.deriv()) * denominator
     slope = slope - 2 * square * numerator * denominator.deriv()
-    roots = np.concatenate([slope.trim().roots(), denominator.trim().roots()])
+    roots = np.concatenate(
+        [polynomial.trim(NEGLIGIBLE).roots() for polynomial in (slope, denominator)]
+    )
     real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
     positive = real[real > 0]
     return float(np.sqrt(positive.min())) if len(positive) else float("inf")

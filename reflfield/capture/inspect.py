@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT
-from reflfield.capture.model import Capture
+from reflfield.capture.model import PLANE, Capture
 from reflfield.progress import track
 
 Range = tuple[float, float]
@@ -87,8 +87,7 @@ class CaptureSummary:
             f"image sizes   {sizes}",
             f"values        {low:.4g} .. {top:.4g}, 99th percentile {high:.4g}, "
             f"{self.n_negative} negative (in {self.n_photographs_read} photographs)",
-            f"silhouettes   {self.silhouettes_given} of {self.n_views} given"
-            f"{_coverage(self.silhouette_coverage)}",
+            f"silhouettes   {self.silhouettes_given} of {self.n_views} given{_coverage(self)}",
         ]
 
 
@@ -117,6 +116,8 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
     near = [light.position for light in capture.lights if light.kind in (POINT, SPOT)]
     far = [light.direction for light in capture.lights if light.kind == DIRECTIONAL]
     views = np.concatenate([c.view_directions(centre[None]) for c in capture.cameras])
+    # A flat sample is seen and lit from the camera's side, whatever is up in the picture.
+    pole = -capture.cameras[0].forward if capture.base_geometry == PLANE else capture.up
     lights = [(p - centre) / max(float(np.linalg.norm(p - centre)), 1e-12) for p in near] + far
     return CaptureSummary(
         name=capture.name,
@@ -135,8 +136,8 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
         silhouette_coverage=_silhouette_coverage(capture, sample),
         camera_distances=_distances(positions, centre),
         light_distances=_distances(near, centre),
-        camera_spread=largest_gap(views, capture.up),
-        light_spread=largest_gap(np.reshape(lights, (-1, 3)), capture.up),
+        camera_spread=largest_gap(views, pole),
+        light_spread=largest_gap(np.reshape(lights, (-1, 3)), pole),
         object_centre=centre,
     )
 
@@ -152,8 +153,7 @@ def object_centre(capture: Capture) -> NDArray[np.float64]:
         across = np.eye(3) - np.outer(camera.forward, camera.forward)
         system += across
         right += across @ camera.centre
-    solved: NDArray[np.float64] = np.linalg.solve(system, right)
-    return solved
+    return np.asarray(np.linalg.solve(system, right), dtype=np.float64)
 
 
 def largest_gap(
@@ -242,7 +242,9 @@ def _gap(spread: float | None) -> str:
     return f", largest gap {np.degrees(spread):.0f} degrees" if spread is not None else ""
 
 
-def _coverage(coverage: Range | None) -> str:
+def _coverage(summary: CaptureSummary) -> str:
+    coverage = summary.silhouette_coverage
     if coverage is None:
-        return ", others are made from the photographs"
+        whole = summary.base_geometry == PLANE
+        return ", others are the whole image" if whole else ", others made from the photographs"
     return f", covering {100 * coverage[0]:.1f} .. {100 * coverage[1]:.1f} % of the image"
