@@ -1,0 +1,328 @@
+"""Local frames of all texels from their samples: the room's public entry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.alignment.expectation import TargetFit, fit_targets
+from reflfield.alignment.gauge import Gauged, fix_gauge, fold
+from reflfield.alignment.searching import search
+from reflfield.checks import check_shape, unit_directions
+from reflfield.errors import InputError, ShapeError
+from reflfield.progress import track
+from reflfield.sphere.coupling import Coupled, couple, join_coupled
+from reflfield.sphere.harmonics import check_band_limit
+from reflfield.sphere.projection import Projector
+
+# Texels whose coefficients are kept for the iterations: enough that their mean
+# has converged far below the error of one frame.
+TRAINING_TEXELS = 8192
+TRAINING_BYTES = 256 * 2**20
+BLOCK_BYTES = 64 * 2**20
+
+
+class SampleSource(Protocol):
+    """Samples read block by block, for example from a store on disk."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(n_texels, n_views, n_lights)."""
+
+    def read(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
+        """Samples of some texels, rows ascending; not finite where unobserved."""
+
+
+@dataclass(frozen=True, eq=False)
+class _ArraySource:
+    """Samples that are in memory already."""
+
+    samples: NDArray[np.floating]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.samples.shape
+
+    def read(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
+        return self.samples[rows]
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """One local frame per texel, and how well it is determined.
+
+    Parameters
+    ----------
+    local_from_base : (n, 3, 3) float64
+        Rows tangent, binormal, normal of the texel in base coordinates. The identity for texels
+        without a usable sample.
+    cluster : (n,) int32
+        Material found to fit best; 0 .. n_clusters - 1.
+    score : (n,) float64
+        Normalised correlation with the cluster's target, -1 .. 1; 0 where nothing is observed.
+    margin : (n,) float64
+        Score gap to the best rotation at least 15 degrees away. Near 0: the frame is not
+        determined (a round lobe, a constant).
+    history : (k,) float64
+        Accumulated correlation of the training texels per iteration, over the largest
+        possible. Never falls.
+    targets : Coupled
+        Unit target of each cluster, in the local frame.
+    symmetries : tuple of str
+        Turns about the normal that leave each target unchanged: "none", "half", "all".
+    """
+
+    local_from_base: NDArray[np.float64]
+    cluster: NDArray[np.int32]
+    score: NDArray[np.float64]
+    margin: NDArray[np.float64]
+    history: NDArray[np.float64]
+    targets: Coupled
+    symmetries: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What every step of one alignment needs."""
+
+    source: SampleSource
+    projector: Projector
+    prior: NDArray[np.float32]
+    max_tilt: float | None
+    n_threads: int
+
+
+def align(
+    samples: ArrayLike | SampleSource,
+    views: ArrayLike,
+    lights: ArrayLike,
+    band_limit: int | tuple[int, int] = 8,
+    iterations: int = 4,
+    n_clusters: int = 1,
+    *,
+    refine: bool = True,
+    seed: int = 0,
+    max_tilt: float | None = None,
+    n_threads: int = 1,
+) -> Alignment:
+    """Find one local frame per texel from its reflectance alone.
+
+    Parameters
+    ----------
+    samples : (n, n_views, n_lights) array_like or SampleSource
+        Apparent BRDFs, any scale, not finite where unobserved. A source has ``shape`` and
+        ``read(rows)``; its texels are read in blocks.
+    views, lights : (n_views, 3), (n_lights, 3) array_like
+        Unit vectors in the texels' base frames, z up. Directions with z <= 0 are not used.
+    band_limit : int or (int, int)
+        Degrees below it are used, for views and lights alike or each its own. A
+        direction that does not vary (one view, one light) has 1 in any case.
+    iterations : int
+        Rounds of expectation maximisation at most; at least 1.
+    n_clusters : int
+        Materials to tell apart.
+    refine : bool
+        True: refine the frames on the samples themselves after the harmonic search.
+    seed : int
+        Of the seeding and of the choice of training texels.
+    max_tilt : float, optional
+        Largest tilt of a normal from its base normal, radians. None: any.
+    n_threads : int
+        Blocks worked on at once. The result does not depend on it.
+
+    Returns
+    -------
+    Alignment
+
+    Raises
+    ------
+    ShapeError
+        If shapes do not fit together.
+    InputError
+        If directions are not unit vectors, an option is out of range, or the band limit is
+        higher than the directions support (the message says which is safe).
+
+    Notes
+    -----
+    Targets are found on at most 8,192 texels drawn at random, whose coefficients stay in
+    memory; all others are then read, searched and refined once, block by block. Memory
+    does not depend on n. With fewer texels all of them take part.
+
+    Examples
+    --------
+    >>> from reflfield.sphere.hemisphere import HemisphereGrid
+    >>> directions = HemisphereGrid(7).directions[8:-8]
+    >>> lobe = np.exp(-8 * (1 - directions @ directions.T)).astype(np.float32)
+    >>> result = align(lobe[None], directions, directions, band_limit=4, refine=False)
+    >>> result.local_from_base.shape, result.cluster
+    ((1, 3, 3), array([0], dtype=int32))
+    """
+    # Check the input and build the operators that all texels share.
+    source = _as_source(samples)
+    projector = _projector(source, views, lights, band_limit)
+    _check_options(iterations, n_clusters, max_tilt, n_threads)
+    rng = np.random.default_rng(seed)
+    # Keep the coefficients of some texels, and find targets and their frames.
+    rows = _training_rows(source.shape[0], projector, rng)
+    task = _Task(source, projector, _prior(source, rows), max_tilt, n_threads)
+    training = join_coupled([_coupled(task, part) for part in _blocks(source, rows)])
+    fit = fit_targets(
+        training,
+        n_clusters=n_clusters,
+        iterations=iterations,
+        rng=rng,
+        max_tilt=max_tilt,
+        n_threads=n_threads,
+    )
+    # Give the frames a meaning, then search all texels that have not been searched.
+    weights = np.where(training.norms() > 0, np.maximum(fit.found.score, 0.0), 0.0)
+    gauged = fix_gauge(fit.targets, fit.found.rotations, fit.found.cluster, weights)
+    return _finish(task, rows, fit, gauged)
+
+
+def _as_source(samples: ArrayLike | SampleSource) -> SampleSource:
+    if hasattr(samples, "read") and hasattr(samples, "shape"):
+        return samples  # type: ignore[return-value]
+    array = np.asarray(samples)
+    if array.dtype != np.float64:
+        array = array.astype(np.float32, copy=False)
+    return _ArraySource(array)
+
+
+def _projector(
+    source: SampleSource,
+    views: ArrayLike,
+    lights: ArrayLike,
+    band_limit: int | tuple[int, int],
+) -> Projector:
+    """Check shapes and directions; operators of the common directions."""
+    view, light = unit_directions("views", views), unit_directions("lights", lights)
+    if len(source.shape) != 3 or tuple(source.shape[1:]) != (len(view), len(light)):
+        raise ShapeError(
+            f"samples: expected shape (n, {len(view)}, {len(light)}) for {len(view)} views and "
+            f"{len(light)} lights, received {tuple(source.shape)}"
+        )
+    if source.shape[0] == 0:
+        raise ShapeError("samples: expected at least one texel, received 0")
+    limits = tuple(band_limit) if isinstance(band_limit, tuple) else (band_limit, band_limit)
+    if len(limits) != 2:
+        raise InputError(f"band_limit: expected one or two integers, received {band_limit}")
+    for limit in limits:
+        check_band_limit("band_limit", limit)
+    view_limit, light_limit = (
+        1 if len(d) == 1 else limit for d, limit in zip((view, light), limits, strict=True)
+    )
+    return Projector(view, light, (view_limit, light_limit))
+
+
+def _check_options(
+    iterations: int, n_clusters: int, max_tilt: float | None, n_threads: int
+) -> None:
+    counts = (("iterations", iterations), ("n_clusters", n_clusters), ("n_threads", n_threads))
+    for name, count in counts:
+        if count < 1:
+            raise InputError(f"{name}: expected at least 1, received {count}")
+    if max_tilt is not None and not 0.0 < max_tilt <= np.pi:
+        raise InputError(f"max_tilt: expected radians in (0, pi], received {max_tilt}")
+
+
+def _training_rows(n: int, projector: Projector, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Texels that take part in finding the targets, ascending."""
+    limits = projector.band_limits
+    size = 4 * limits[0] ** 2 * limits[1] ** 2
+    most = min(n, TRAINING_TEXELS, max(TRAINING_BYTES // size, 256))
+    return np.sort(rng.choice(n, most, replace=False)) if most < n else np.arange(n)
+
+
+def _blocks(source: SampleSource, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Parts of `rows` whose samples fit the block size."""
+    each = max(1, BLOCK_BYTES // (4 * source.shape[1] * source.shape[2]))
+    return [rows[first : first + each] for first in range(0, len(rows), each)]
+
+
+def _prior(source: SampleSource, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Mean observed sample of each pair of directions, over some texels."""
+    total = np.zeros(source.shape[1:])
+    count = np.zeros(source.shape[1:])
+    for part in _blocks(source, rows[:: max(1, len(rows) // 1024)]):
+        block = _read(source, part)
+        observed = np.isfinite(block)
+        size = np.abs(np.where(observed, block, 0)).max(axis=(1, 2), keepdims=True)
+        total += np.where(observed, block / np.where(size > 0, size, 1), 0).sum(axis=0)
+        count += observed.sum(axis=0)
+    known = count > 0
+    middle = total.sum() / max(count.sum(), 1.0)
+    return np.where(known, total / np.where(known, count, 1), middle).astype(np.float32)
+
+
+def _read(source: SampleSource, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Samples of some texels; entries that a float32 cannot hold count as unobserved."""
+    block = np.asarray(source.read(rows), dtype=np.float64)
+    check_shape("samples.read(rows)", block, (len(rows), *source.shape[1:]))
+    return np.where(np.isfinite(block), block, np.nan)
+
+
+def _coupled(task: _Task, rows: NDArray[np.int64]) -> Coupled:
+    """Coupled coefficients of some texels, each scaled by a power of two or more to order 1."""
+    return couple_samples(task, _unit_samples(_read(task.source, rows)))
+
+
+def _unit_samples(block: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Samples over the largest of each texel, so that float32 holds any input scale."""
+    largest = np.abs(np.where(np.isfinite(block), block, 0)).max(axis=(1, 2), keepdims=True)
+    return (block / np.where(largest > 0, largest, 1.0)).astype(np.float32)
+
+
+def couple_samples(task: _Task, block: NDArray[np.float32]) -> Coupled:
+    """Fill, project and couple."""
+    return couple(task.projector.project(task.projector.fill(block, task.prior)))
+
+
+def _finish(task: _Task, rows: NDArray[np.int64], fit: TargetFit, gauged: Gauged) -> Alignment:
+    """Frames of all texels: those of the training, and the search of the rest."""
+    n = task.source.shape[0]
+    base_from_local = np.tile(np.eye(3), (n, 1, 1))
+    cluster = np.zeros(n, np.int32)
+    score, margin = np.zeros(n), np.zeros(n)
+    base_from_local[rows], cluster[rows] = gauged.rotations, fit.found.cluster
+    score[rows], margin[rows] = fit.found.score, fit.found.margin
+    for part in _remaining(task.source, n, rows):
+        found = search(
+            _coupled(task, part),
+            gauged.targets,
+            max_tilt=task.max_tilt,
+            n_threads=task.n_threads,
+        )
+        base_from_local[part] = _fold_all(found.rotations, found.cluster, gauged)
+        cluster[part], score[part], margin[part] = found.cluster, found.score, found.margin
+    return Alignment(
+        local_from_base=np.ascontiguousarray(np.swapaxes(base_from_local, 1, 2)),
+        cluster=cluster,
+        score=score,
+        margin=margin,
+        history=fit.history,
+        targets=gauged.targets,
+        symmetries=tuple(symmetry.kind for symmetry in gauged.symmetries),
+    )
+
+
+def _fold_all(
+    rotations: NDArray[np.float64], cluster: NDArray[np.int32], gauged: Gauged
+) -> NDArray[np.float64]:
+    folded = rotations.copy()
+    for k, symmetry in enumerate(gauged.symmetries):
+        folded[cluster == k] = fold(rotations[cluster == k], symmetry)
+    return folded
+
+
+def _remaining(
+    source: SampleSource, n: int, rows: NDArray[np.int64]
+) -> Iterator[NDArray[np.int64]]:
+    """Blocks of the texels that are not among `rows`."""
+    rest = np.setdiff1d(np.arange(n), rows, assume_unique=True)
+    blocks = _blocks(source, rest)
+    return track(blocks, len(blocks), "frames of all texels")

@@ -1,0 +1,210 @@
+r"""Which of many equivalent sets of frames is meant.
+
+The target of a cluster may be turned freely if all its frames turn along. The
+gauge makes the frames of each cluster on average the base frames, so that
+neighbouring clusters agree. Where the target has a half-turn symmetry, as nearly all
+reflectances have, its axis is the normal: it is known far better than the mean of tilted
+frames. What the reflectance itself leaves open about the normal is chosen nearest to
+the base frame: the turn of an isotropic target, and the sign of the tangent of one that a
+half turn leaves unchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.alignment.correlation import spectrum
+from reflfield.alignment.searching import follow, rotation_about
+from reflfield.sphere.coupling import Coupled, rotate_coupled
+from reflfield.sphere.rotations import frames_from_normals
+from reflfield.sphere.wigner import rotation_blocks
+
+# Share of a target's energy that varies about the normal, below which the turn is noise.
+ISOTROPIC_SHARE = 0.01
+# Odd orders of a target with a half-turn symmetry vanish; noise and gaps leave a few per cent.
+HALF_TURN_SHARE = 0.25
+AXIS_STEPS = 20
+# A symmetry axis farther from the mean normal is not the normal.
+LARGEST_AXIS_TILT = np.deg2rad(40.0)
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """Turns about the normal that leave a target unchanged: "none", "half" or "all"."""
+
+    kind: str
+
+
+def symmetry_about_normal(target: Coupled) -> Symmetry:
+    """Symmetry of one target whose normal is z, from its energy per order.
+
+    Examples
+    --------
+    >>> from reflfield.sphere.coupling import couple
+    >>> lobe = np.zeros((1, 9, 9)); lobe[0, :, 6] = 1.0
+    >>> symmetry_about_normal(couple(np.ones((1, 1, 1)))).kind
+    'all'
+    """
+    energy = np.zeros(target.n_degrees)
+    for j, block in enumerate(target.blocks):
+        by_order = np.sum(block[0].astype(np.float64) ** 2, axis=1)
+        energy[: j + 1] += by_order[j:]
+        energy[1 : j + 1] += by_order[:j][::-1]
+    varying, odd = energy[1:].sum(), energy[1::2].sum()
+    if varying <= ISOTROPIC_SHARE * energy.sum():
+        return Symmetry("all")
+    if odd <= HALF_TURN_SHARE * (varying - odd):
+        return Symmetry("half")
+    return Symmetry("none")
+
+
+def mean_rotation(
+    rotations: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotation with the least squared chordal distance to many, (3, 3).
+
+    Examples
+    --------
+    >>> about = rotation_about(np.array([[0.0, 0, 1], [0, 0, 1]]), [0.1, 0.3])
+    >>> float(np.arcsin(mean_rotation(about, np.ones(2))[1, 0]).round(12))
+    0.2
+    """
+    total = np.einsum("n,nij->ij", weights, rotations)
+    u, _, vt = np.linalg.svd(total)
+    sign = np.sign(np.linalg.det(u @ vt)) or 1.0
+    return u @ np.diag([1.0, 1.0, sign]) @ vt
+
+
+def twist(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle about z that brings each rotation closest to the identity, radians.
+
+    Examples
+    --------
+    >>> twist(rotation_about(np.array([[0.0, 0.0, 1.0]]), 0.4)).round(12)
+    array([0.4])
+    """
+    return np.arctan2(
+        rotations[:, 1, 0] - rotations[:, 0, 1], rotations[:, 0, 0] + rotations[:, 1, 1]
+    )
+
+
+def fold(rotations: NDArray[np.float64], symmetry: Symmetry) -> NDArray[np.float64]:
+    """Equivalent rotations nearest to the identity.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64
+        `base_from_local`.
+    symmetry : Symmetry
+        Of the target.
+
+    Returns
+    -------
+    (n, 3, 3) float64
+
+    Examples
+    --------
+    >>> turn = rotation_about(np.array([[0.0, 0.0, 1.0]]), 3.0)
+    >>> twist(fold(turn, Symmetry("half"))).round(4)
+    array([-0.1416])
+    """
+    if symmetry.kind == "none" or len(rotations) == 0:
+        return rotations
+    angle = twist(rotations)
+    undo = -angle if symmetry.kind == "all" else np.where(np.abs(angle) > np.pi / 2, np.pi, 0)
+    axes = np.tile([0.0, 0.0, 1.0], (len(rotations), 1))
+    return rotations @ rotation_about(axes, undo)
+
+
+def _gauge_turn(
+    rotations: NDArray[np.float64], weights: NDArray[np.float64], symmetry: Symmetry
+) -> NDArray[np.float64]:
+    """Turn about z that undoes the mean twist, known up to the symmetry."""
+    n_fold = 2.0 if symmetry.kind == "half" else 1.0
+    phase = np.sum(weights * np.exp(1j * n_fold * twist(rotations)))
+    angle = 0.0 if symmetry.kind == "all" else -float(np.angle(phase)) / n_fold
+    return rotation_about(np.array([[0.0, 0.0, 1.0]]), angle)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Gauged:
+    """Targets and frames after the gauge.
+
+    Parameters
+    ----------
+    targets : Coupled
+        One a cluster, normal z.
+    rotations : (n, 3, 3) float64
+        `base_from_local`.
+    symmetries : tuple of Symmetry
+        One a cluster.
+    """
+
+    targets: Coupled
+    rotations: NDArray[np.float64]
+    symmetries: tuple[Symmetry, ...]
+
+
+def fix_gauge(
+    targets: Coupled,
+    rotations: NDArray[np.float64],
+    cluster: NDArray[np.int32],
+    weights: NDArray[np.float64],
+) -> Gauged:
+    """Turn each target so that its frames are on average the base frames.
+
+    Parameters
+    ----------
+    targets : Coupled
+        One a cluster.
+    rotations : (n, 3, 3) float64
+        `base_from_local`.
+    cluster : (n,) int32
+    weights : (n,) float64
+        Of the frames in the average.
+
+    Returns
+    -------
+    Gauged
+    """
+    rotations = rotations.copy()
+    turns = np.tile(np.eye(3), (len(targets), 1, 1))
+    symmetries = []
+    for k in range(len(targets)):
+        mine = (cluster == k) & (weights > 0)
+        kind = Symmetry("none")
+        if mine.any():
+            turns[k] = mean_rotation(rotations[mine], weights[mine]).T
+            upright = turns[k] @ _normal_first(_turn_target(targets[k : k + 1], turns[k]))
+            kind = symmetry_about_normal(_turn_target(targets[k : k + 1], upright))
+            turns[k] = turns[k] if kind.kind == "none" else upright
+            turns[k] = turns[k] @ _gauge_turn(rotations[mine] @ turns[k], weights[mine], kind)
+            rotations[cluster == k] = fold(rotations[cluster == k] @ turns[k], kind)
+        symmetries.append(kind)
+    blocks = rotation_blocks(np.swapaxes(turns, 1, 2), targets.n_degrees, str(targets.dtype))
+    return Gauged(rotate_coupled(targets, blocks), rotations, tuple(symmetries))
+
+
+def _normal_first(target: Coupled) -> NDArray[np.float64]:
+    """Rotation that brings z to the axis of the target's half-turn symmetry, if near z.
+
+    The symmetry is a peak of the target's correlation with itself, half a turn away from
+    the identity; the climb begins with the half turn about z.
+    """
+    half_turn = np.diag([-1.0, -1.0, 1.0])[None]
+    series = spectrum(target, target)
+    found = follow(series, np.zeros(1, np.int64), half_turn, AXIS_STEPS)[0][0]
+    # Half turns are 2 u u^T - I.
+    axis = np.linalg.eigh(found + found.T)[1][:, 2]
+    axis *= np.sign(axis[2]) or 1.0
+    if axis[2] < np.cos(LARGEST_AXIS_TILT):
+        return np.eye(3)
+    return frames_from_normals(axis[None], np.array([[1.0, 0.0, 0.0]]))[0].T
+
+
+def _turn_target(target: Coupled, turn: NDArray[np.float64]) -> Coupled:
+    blocks = rotation_blocks(turn.T[None], target.n_degrees, str(target.dtype))
+    return rotate_coupled(target, blocks)

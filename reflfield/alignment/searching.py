@@ -1,0 +1,366 @@
+"""Best rotation, and best target, of many functions: the E-step of the alignment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypedDict, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.alignment.correlation import (
+    COARSE_DEGREES,
+    COARSE_ROTATIONS,
+    PEAK_DISTANCE,
+    POLISHING_STEPS,
+    SCREENING_STEPS,
+    climb,
+    coarse_grid,
+    highest_maxima,
+    spectrum,
+)
+from reflfield.checks import check_shape
+from reflfield.errors import InputError
+from reflfield.sphere.coupling import Coupled
+from reflfield.sphere.wigner import block_offsets, degree_tables
+
+# Functions handled together: their series and coarse values stay within a few MB.
+BLOCK = 256
+N_PEAKS = 4
+# Targets whose coarse peak is among the best few are searched with all degrees.
+N_FINALISTS = 3
+Result = TypeVar("Result")
+
+
+class SearchOptions(TypedDict):
+    """Options of `search` that all steps of an alignment share."""
+
+    max_tilt: float | None
+    n_threads: int
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    r"""Where each function correlates best with the target.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64
+        `base_from_local`: the source is the target turned by this, :math:`a(\omega) \approx
+        c(R^\top\omega)`. The identity where source or target is zero.
+    score : (n,) float64
+        Correlation over both norms, in [-1, 1]; 0 for a zero function.
+    margin : (n,) float64
+        Score gap to the best rotation at least 15 degrees away: another peak, or the weakest
+        direction of this one. Near 0 the rotation is not determined.
+    cluster : (n,) int32
+        Target found best.
+    """
+
+    rotations: NDArray[np.float64]
+    score: NDArray[np.float64]
+    margin: NDArray[np.float64]
+    cluster: NDArray[np.int32]
+
+
+def search(
+    source: Coupled,
+    target: Coupled,
+    *,
+    start: ArrayLike | None = None,
+    max_tilt: float | None = None,
+    n_peaks: int = N_PEAKS,
+    n_threads: int = 1,
+) -> SearchResult:
+    r"""Rotations that best carry a target onto each function; the best target if many.
+
+    Parameters
+    ----------
+    source : Coupled
+        n functions of two directions (`reflfield.sphere.coupling.couple`).
+    target : Coupled
+        One or more functions, same band limits; clusters if several.
+    start : (n, 3, 3) array_like, optional
+        Rotations to try as well (with every finalist target).
+    max_tilt : float, optional
+        Largest angle between z and the turned z, radians. None: all rotations.
+    n_peaks : int
+        Local maxima of the coarse grid that are followed with all degrees.
+    n_threads : int
+        Blocks worked on at once. The result does not depend on it.
+
+    Returns
+    -------
+    SearchResult
+
+    Raises
+    ------
+    InputError
+        If band limits differ or an option is out of range.
+    ShapeError
+        If `start` does not fit.
+
+    Examples
+    --------
+    A turned function is found again:
+
+    >>> from reflfield.sphere.coupling import couple, rotate_coupled
+    >>> from reflfield.sphere.rotations import matrix_from_euler
+    >>> from reflfield.sphere.wigner import rotation_blocks
+    >>> rng = np.random.default_rng(0)
+    >>> target = couple(rng.standard_normal((1, 9, 9)).astype(np.float32))
+    >>> truth = matrix_from_euler(0.3, 0.5, -0.2)[None]
+    >>> found = search(rotate_coupled(target, rotation_blocks(truth, 5)), target)
+    >>> bool(np.abs(found.rotations - truth).max() < 1e-3), float(found.score[0].round(4))
+    (True, 1.0)
+    """
+    _check_search(source, target, max_tilt, n_peaks)
+    n = len(source)
+    starts = None
+    if start is not None:
+        starts = np.asarray(start, dtype=np.float64)
+        check_shape("start", starts, (n, 3, 3))
+    norms = np.maximum(target.norms(), 1e-300)
+    targets = [target[k : k + 1].scaled(1.0 / norms[k : k + 1]) for k in range(len(target))]
+
+    def block(rows: slice) -> SearchResult:
+        extra = None if starts is None else starts[rows]
+        return _search_block(source[rows], targets, extra, max_tilt, n_peaks)
+
+    parts = map_blocks(block, n, BLOCK, n_threads)
+    return SearchResult(
+        rotations=np.concatenate([part.rotations for part in parts]),
+        score=np.concatenate([part.score for part in parts]),
+        margin=np.concatenate([part.margin for part in parts]),
+        cluster=np.concatenate([part.cluster for part in parts]),
+    )
+
+
+def map_blocks(
+    work: Callable[[slice], Result], n: int, size: int, n_threads: int
+) -> list[Result]:
+    """Results of `work` on consecutive blocks of rows, in order."""
+    blocks = [slice(first, min(first + size, n)) for first in range(0, max(n, 1), size)]
+    if n_threads == 1 or len(blocks) == 1:
+        return [work(block) for block in blocks]
+    with ThreadPoolExecutor(n_threads) as pool:
+        return list(pool.map(work, blocks))
+
+
+def _check_search(
+    source: Coupled, target: Coupled, max_tilt: float | None, n_peaks: int
+) -> None:
+    if source.band_limits != target.band_limits:
+        raise InputError(
+            f"target: expected band limits {source.band_limits} like source, "
+            f"received {target.band_limits}"
+        )
+    if max_tilt is not None and not 0.0 < max_tilt <= np.pi:
+        raise InputError(f"max_tilt: expected radians in (0, pi], received {max_tilt}")
+    if not 1 <= n_peaks <= 32:
+        raise InputError(f"n_peaks: expected 1 to 32, received {n_peaks}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Rotations in question: `rows` sorted, one entry per function and candidate."""
+
+    rows: NDArray[np.int64]
+    rotations: NDArray[np.float64]
+
+
+def _search_block(
+    source: Coupled,
+    targets: Sequence[Coupled],
+    start: NDArray[np.float64] | None,
+    max_tilt: float | None,
+    n_peaks: int,
+) -> SearchResult:
+    """Search of a few functions against all (unit) targets."""
+    norms = source.norms()
+    # Unit functions, so that the float32 kernels never meet 1e-12 or 1e12.
+    source = source.scaled(np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0))
+    series = [spectrum(source, target) for target in targets]
+    coarse = [_coarse_peaks(s, source.n_degrees, max_tilt, n_peaks) for s in series]
+    best = SearchResult(
+        rotations=np.tile(np.eye(3), (len(source), 1, 1)),
+        score=np.full(len(source), -np.inf),
+        margin=np.zeros(len(source)),
+        cluster=np.zeros(len(source), np.int32),
+    )
+    heights = np.stack([height for _, height in coarse])
+    rank = np.argsort(np.argsort(-heights, axis=0, kind="stable"), axis=0, kind="stable")
+    for k in range(len(targets)):
+        final = np.flatnonzero(rank[k] < N_FINALISTS)
+        candidates = _candidates(coarse[k][0], final, start)
+        _keep_better(best, series[k], candidates, k, max_tilt)
+    nothing = ~(norms > 0) | ~np.isfinite(best.score)
+    best.score[nothing] = 0.0
+    best.margin[nothing] = 0.0
+    best.rotations[nothing] = np.eye(3)
+    return best
+
+
+def _coarse_peaks(
+    series: NDArray[np.floating], n_degrees: int, max_tilt: float | None, n_peaks: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(n, n_peaks, 3, 3) rotations of the coarse maxima (NaN: fewer) and the highest value."""
+    low = min(n_degrees, COARSE_DEGREES)
+    grid = coarse_grid(low, COARSE_ROTATIONS, max_tilt, str(series.dtype))
+    values = series[:, : block_offsets(low)[-1]] @ grid.blocks.T
+    found = np.full((len(series), n_peaks), -1, np.int32)
+    highest_maxima(values, grid.neighbours, found)
+    rotations = np.where(found[:, :, None, None] >= 0, grid.rotations[found], np.nan)
+    return rotations, values.max(axis=1).astype(np.float64)
+
+
+def _candidates(
+    peaks: NDArray[np.float64], final: NDArray[np.int64], start: NDArray[np.float64] | None
+) -> _Candidates:
+    """All rotations to follow for the functions `final`."""
+    every = peaks[final]
+    if start is not None:
+        every = np.concatenate([start[final][:, None], every], axis=1)
+    rows = np.repeat(final, every.shape[1])
+    flat = every.reshape(-1, 3, 3)
+    real = np.isfinite(flat[:, 0, 0])
+    return _Candidates(rows[real], flat[real])
+
+
+def follow(
+    series: NDArray[np.floating],
+    rows: NDArray[np.int64],
+    rotations: NDArray[np.float64],
+    n_steps: int,
+    max_tilt: float | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Climb from each rotation with all degrees.
+
+    Parameters
+    ----------
+    series : (n, k) float
+        See `spectrum`.
+    rows : (c,) int64
+        Series that each rotation climbs on.
+    rotations : (c, 3, 3) float64
+        Where to begin.
+    n_steps : int
+        0: evaluate only.
+    max_tilt : float, optional
+        Radians.
+
+    Returns
+    -------
+    rotations : (c, 3, 3) float64
+    found : (c, 11) float64
+        Value, gradient, Hessian (xx, yy, zz, xy, xz, yz), length of the next step.
+    """
+    n_degrees = int(np.searchsorted(block_offsets(64), series.shape[1]))
+    tables = degree_tables(n_degrees, str(series.dtype))
+    moved = np.ascontiguousarray(rotations, dtype=np.float64).copy()
+    found = np.zeros((len(moved), 11))
+    lowest_z = -2.0 if max_tilt is None else float(np.cos(max_tilt))
+    climb(
+        series,
+        np.ascontiguousarray(rows, dtype=np.int64),
+        moved,
+        n_steps,
+        lowest_z,
+        tables.row_start,
+        tables.recursion,
+        tables.edge,
+        tables.ladder,
+        found,
+    )
+    return moved, found
+
+
+def _keep_better(
+    best: SearchResult,
+    series: NDArray[np.floating],
+    candidates: _Candidates,
+    k: int,
+    max_tilt: float | None,
+) -> None:
+    """Update `best` in place with target k for the functions that have candidates."""
+    if len(candidates.rows) == 0:
+        return
+    rows = candidates.rows
+    moved, found = follow(series, rows, candidates.rotations, SCREENING_STEPS, max_tilt)
+    first = best_of_each(rows, found[:, 0])
+    who = rows[first]
+    top, at_top = follow(series, who, moved[first], POLISHING_STEPS, max_tilt)
+    gap = np.minimum(
+        _gap_to_other_peaks(rows, moved, found[:, 0], who, top, at_top[:, 0]),
+        _gap_of_weakest_turn(series, who, top, at_top),
+    )
+    better = at_top[:, 0] > best.score[who]
+    who, top, at_top, gap = who[better], top[better], at_top[better], gap[better]
+    best.rotations[who] = top
+    best.score[who] = at_top[:, 0]
+    best.margin[who] = np.maximum(gap, 0.0)
+    best.cluster[who] = k
+
+
+def best_of_each(rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Index of the highest value within each run of equal rows.
+
+    Examples
+    --------
+    >>> best_of_each(np.array([0, 0, 3, 3]), np.array([1.0, 2.0, 5.0, 4.0]))
+    array([1, 2])
+    """
+    order = np.lexsort((np.arange(len(rows)), -values, rows))
+    return order[np.concatenate([[True], np.diff(rows[order]) > 0])]
+
+
+def _gap_to_other_peaks(
+    rows: NDArray[np.int64],
+    moved: NDArray[np.float64],
+    values: NDArray[np.float64],
+    who: NDArray[np.int64],
+    top: NDArray[np.float64],
+    height: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Height above the best candidate that ended elsewhere."""
+    index = np.searchsorted(who, rows)
+    cosine = 0.5 * (np.einsum("nij,nij->n", moved, top[index]) - 1.0)
+    elsewhere = cosine < np.cos(PEAK_DISTANCE)
+    gap = np.full(len(who), np.inf)
+    np.minimum.at(gap, index[elsewhere], (height[index] - values)[elsewhere])
+    return gap
+
+
+def _gap_of_weakest_turn(
+    series: NDArray[np.floating],
+    who: NDArray[np.int64],
+    top: NDArray[np.float64],
+    at_top: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Height above the better of two turns about the axis of least curvature."""
+    hessian = at_top[:, [4, 7, 8, 7, 5, 9, 8, 9, 6]].reshape(-1, 3, 3)
+    axis = np.linalg.eigh(hessian)[1][:, :, 2]
+    gap = np.full(len(who), np.inf)
+    for angle in (PEAK_DISTANCE, -PEAK_DISTANCE):
+        turned = top @ rotation_about(axis, angle)
+        gap = np.minimum(gap, at_top[:, 0] - follow(series, who, turned, 0)[1][:, 0])
+    return gap
+
+
+def rotation_about(axis: NDArray[np.float64], angle: ArrayLike) -> NDArray[np.float64]:
+    """Rotations by `angle` about unit axes, (n, 3, 3).
+
+    Examples
+    --------
+    >>> rotation_about(np.array([[0.0, 0.0, 1.0]]), np.pi / 2).round(12)[0] + 0.0
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
+    """
+    angle = np.broadcast_to(angle, axis.shape[:1])[:, None, None]
+    cross = np.zeros((len(axis), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = axis
+    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
+    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)

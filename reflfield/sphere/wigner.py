@@ -1,0 +1,423 @@
+r"""Wigner-d matrices and rotation of real harmonic coefficients.
+
+Complex convention: :math:`D^j_{mn}(R) = e^{-im\alpha} d^j_{mn}(\beta) e^{-in\gamma}` with
+``R = Rz(alpha) @ Ry(beta) @ Rz(gamma)``; the coefficients of the turned
+function :math:`f(R^T\omega)` are :math:`D(R)` times those of :math:`f`. The same
+holds for the real matrices :math:`\Delta^j(R)` of this module and the real harmonics of
+`reflfield.sphere.harmonics`: :math:`\Delta^1(R)` is `R` in the order (y, z, x) and
+:math:`\Delta(R_1 R_2) = \Delta(R_1)\Delta(R_2)`.
+
+Recursion: degree upwards at fixed orders from ``j = max(|m|, |n|)``, which is
+the stable direction (Kostelec and Rockmore, "FFTs on the rotation group",
+Journal of Fourier Analysis and Applications 2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.checks import check_shape
+from reflfield.errors import InputError
+
+# Room left and right of each row of stored d, so that orders n - 2 .. n + 2 can be
+# read without a test.
+ROW_MARGIN = 2
+MAX_DEGREE = 256
+
+
+def block_offsets(degree_limit: int) -> NDArray[np.int64]:
+    """Where each degree's (2j+1, 2j+1) block starts in a flat list of blocks.
+
+    Examples
+    --------
+    >>> block_offsets(3)
+    array([ 0,  1, 10, 35])
+    """
+    sizes = (2 * np.arange(degree_limit, dtype=np.int64) + 1) ** 2
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+def wigner_d(degree: int, beta: float) -> NDArray[np.float64]:
+    r"""Matrix :math:`d^j_{mn}(\beta)` of one degree.
+
+    Parameters
+    ----------
+    degree : int
+        0 .. 256.
+    beta : float
+        Angle, radians.
+
+    Returns
+    -------
+    (2 * degree + 1, 2 * degree + 1) float64
+        Row ``m + degree``, column ``n + degree``. Orthogonal to 1e-12 at degree 256.
+
+    Raises
+    ------
+    InputError
+        If the degree is out of range or the angle is not finite.
+
+    Examples
+    --------
+    >>> wigner_d(1, np.pi / 3).round(3)
+    array([[ 0.75 ,  0.612,  0.25 ],
+           [-0.612,  0.5  ,  0.612],
+           [ 0.25 , -0.612,  0.75 ]])
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise InputError(f"degree: expected 0 to {MAX_DEGREE}, received {degree}")
+    if not np.isfinite(beta):
+        raise InputError(f"beta: expected a finite angle, received {beta}")
+    older = np.zeros((1, 1))
+    newer = np.ones((1, 1))
+    edge = np.ones(1)
+    for j in range(1, degree + 1):
+        edge = _edge_row(edge, j, beta)
+        older, newer = newer, _next_degree(older, newer, edge, j, beta)
+    return newer
+
+
+def _edge_row(edge: NDArray[np.float64], j: int, beta: float) -> NDArray[np.float64]:
+    """Row d^j_{j,n} from row d^{j-1}_{j-1,n}."""
+    orders = np.arange(-j + 1, j)
+    row = np.zeros(2 * j + 1)
+    growth = np.sqrt(2.0 * j * (2.0 * j - 1.0) / ((j + orders) * (j - orders)))
+    row[1:-1] = edge * growth * (-0.5 * np.sin(beta))
+    row[0] = np.sin(0.5 * beta) ** (2 * j)
+    row[-1] = np.cos(0.5 * beta) ** (2 * j)
+    return row
+
+
+def _next_degree(
+    older: NDArray[np.float64],
+    newer: NDArray[np.float64],
+    edge: NDArray[np.float64],
+    j: int,
+    beta: float,
+) -> NDArray[np.float64]:
+    """Matrix of degree j from those of degrees j - 2 and j - 1 and its last row."""
+    matrix = np.zeros((2 * j + 1, 2 * j + 1))
+    orders = np.arange(-j, j + 1)
+    sign = np.where((orders - j) % 2, -1.0, 1.0)
+    matrix[-1] = edge
+    matrix[:, -1] = sign * edge
+    matrix[:, 0] = edge[::-1]
+    matrix[0] = (sign * edge)[::-1]
+    i = j - 1
+    inner = orders[1:-1].astype(np.float64)
+    now, last = j**2 - inner**2, np.maximum(i**2 - inner**2, 0.0)
+    centre = i * j * np.cos(beta) - np.outer(inner, inner)
+    total = (2 * i + 1) * centre * newer
+    if i > 0:
+        total[1:-1, 1:-1] -= j * np.sqrt(np.outer(last, last))[1:-1, 1:-1] * older
+        matrix[1:-1, 1:-1] = total / (i * np.sqrt(np.outer(now, now)))
+    else:
+        matrix[1, 1] = np.cos(beta)
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class DegreeTables:
+    """Constants of the recursion for degrees 0 .. `degree_limit` - 1, flat by rows.
+
+    Only rows m >= 0 are kept: those of negative order follow by symmetry. The
+    row of (j, m) begins at ``row_start[j] + m * width`` with
+    ``width = 2 * j + 1 + 2 * ROW_MARGIN`` and holds orders -j .. j inside zero margins.
+
+    Parameters
+    ----------
+    degree_limit : int
+        Degrees 0 .. `degree_limit` - 1.
+    row_start : (degree_limit + 1,) int64
+        First entry of each degree.
+    recursion : (3, n) float
+        d^j = (recursion[0] * cos(beta) - recursion[1]) d^{j-1} - recursion[2] d^{j-2}.
+    edge : (degree_limit, 2 * degree_limit - 1) float
+        Factors of the last row, per degree and order, centred.
+    ladder : (6, n) float
+        Order n; c+; c-; c+ c+; c- c-; j (j + 1) - n^2, the matrix elements of
+        the generators that the derivatives need.
+    """
+
+    degree_limit: int
+    row_start: NDArray[np.int64]
+    recursion: NDArray[np.floating]
+    edge: NDArray[np.floating]
+    ladder: NDArray[np.floating]
+
+
+@lru_cache(maxsize=16)
+def degree_tables(degree_limit: int, dtype: str = "float32") -> DegreeTables:
+    """Constants of the recursion; kept in memory once built.
+
+    Examples
+    --------
+    >>> degree_tables(3).row_start
+    array([ 0,  5, 19, 46])
+    """
+    degrees = np.arange(degree_limit, dtype=np.int64)
+    sizes = (degrees + 1) * (2 * degrees + 1 + 2 * ROW_MARGIN)
+    start = np.concatenate([[0], np.cumsum(sizes)])
+    recursion = np.zeros((3, start[-1]))
+    ladder = np.zeros((6, start[-1]))
+    edge = np.zeros((degree_limit, 2 * degree_limit - 1))
+    for j in range(degree_limit):
+        part = slice(start[j], start[j + 1])
+        recursion[:, part] = _recursion_of_degree(j).reshape(3, -1)
+        ladder[:, part] = _ladder_of_degree(j).reshape(6, -1)
+        n = np.arange(-j + 1, j)
+        growth = np.sqrt(2.0 * j * (2.0 * j - 1.0) / ((j + n) * (j - n)))
+        edge[j, n + degree_limit - 1] = growth
+    return DegreeTables(
+        degree_limit, start, recursion.astype(dtype), edge.astype(dtype), ladder.astype(dtype)
+    )
+
+
+def _recursion_of_degree(j: int) -> NDArray[np.float64]:
+    """(3, j + 1, width) factors that give degree j from j - 1 and j - 2."""
+    out = np.zeros((3, j + 1, 2 * j + 1 + 2 * ROW_MARGIN))
+    i = j - 1
+    if j == 0:
+        return out
+    m = np.arange(j, dtype=np.float64)[:, None]
+    n = np.arange(-i, i + 1, dtype=np.float64)[None, :]
+    columns = slice(ROW_MARGIN + 1, ROW_MARGIN + 2 * j)
+    if i == 0:
+        out[0, 0, columns] = 1.0
+        return out
+    below = i * np.sqrt((j**2 - m**2) * (j**2 - n**2))
+    out[0, :j, columns] = (2 * i + 1) * i * j / below
+    out[1, :j, columns] = (2 * i + 1) * m * n / below
+    out[2, :j, columns] = j * np.sqrt((i**2 - m**2) * (i**2 - n**2)) / below
+    return out
+
+
+def _ladder_of_degree(j: int) -> NDArray[np.float64]:
+    """(6, j + 1, width) generator elements of degree j, the same for every row."""
+    n = np.arange(-j, j + 1, dtype=np.float64)
+    up = np.sqrt((j - n) * (j + n + 1))
+    down = np.sqrt((j + n) * (j - n + 1))
+    up2 = up * np.sqrt(np.maximum((j - n - 1) * (j + n + 2), 0.0))
+    down2 = down * np.sqrt(np.maximum((j + n - 1) * (j - n + 2), 0.0))
+    rows = np.stack([n, up, down, up2, down2, j * (j + 1) - n**2])
+    out = np.zeros((6, j + 1, 2 * j + 1 + 2 * ROW_MARGIN))
+    out[:, :, ROW_MARGIN : ROW_MARGIN + 2 * j + 1] = rows[:, None, :]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def fill_wigner_d(
+    beta: float,
+    row_start: NDArray[np.int64],
+    recursion: NDArray[np.floating],
+    edge: NDArray[np.floating],
+    d: NDArray[np.floating],
+) -> None:
+    """All d^j_{mn}(beta), m >= 0, into the flat rows of `DegreeTables`."""
+    degree_limit = row_start.shape[0] - 1
+    one = d.dtype.type(1.0)
+    cosine = d.dtype.type(np.cos(beta))
+    half_sine = d.dtype.type(-0.5 * np.sin(beta))
+    cosine2 = d.dtype.type(np.cos(0.5 * beta) ** 2)
+    sine2 = d.dtype.type(np.sin(0.5 * beta) ** 2)
+    top, bottom = one, one
+    d[ROW_MARGIN] = one
+    for j in range(1, degree_limit):
+        width = 2 * j + 1 + 2 * ROW_MARGIN
+        start, before = row_start[j], row_start[j - 1]
+        twice = row_start[j - 2] if j > 1 else 0
+        # Rows m < j, orders |n| < j: recursion over the degree.
+        for m in range(j):
+            row = start + m * width + ROW_MARGIN + 1
+            row1 = before + m * (width - 2) + ROW_MARGIN
+            for k in range(2 * j - 1):
+                d[row + k] = (recursion[0, row + k] * cosine - recursion[1, row + k]) * d[
+                    row1 + k
+                ]
+            if m < j - 1:
+                row2 = twice + m * (width - 4) + ROW_MARGIN
+                for k in range(2 * j - 3):
+                    d[row + 1 + k] -= recursion[2, row + 1 + k] * d[row2 + k]
+        # Row m = j, then the columns n = -j and j of the others by symmetry.
+        top *= cosine2
+        bottom *= sine2
+        row = start + j * width + ROW_MARGIN
+        row1 = before + (j - 1) * (width - 2) + ROW_MARGIN
+        d[row] = bottom
+        d[row + 2 * j] = top
+        for k in range(2 * j - 1):
+            d[row + 1 + k] = d[row1 + k] * edge[j, k + degree_limit - j] * half_sine
+        for m in range(j):
+            other = start + m * width + ROW_MARGIN
+            value = d[row + j + m]
+            d[other + 2 * j] = value if (j - m) % 2 == 0 else -value
+            d[other] = d[row + j - m]
+
+
+@numba.njit(cache=True, nogil=True)
+def euler_from_matrix(r: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Angles (alpha, beta, gamma), zyz, of one rotation; gamma = 0 where beta is 0 or pi."""
+    sine = np.hypot(r[0, 2], r[1, 2])
+    beta = np.arctan2(sine, r[2, 2])
+    if sine > 1e-14:
+        return np.arctan2(r[1, 2], r[0, 2]), beta, np.arctan2(r[2, 1], -r[2, 0])
+    # At a pole only alpha +- gamma is determined.
+    if r[2, 2] > 0.0:
+        return np.arctan2(r[1, 0], r[0, 0]), beta, 0.0
+    return np.arctan2(-r[1, 0], -r[0, 0]), beta, 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_phases(angle: float, lowest: int, phases: NDArray[np.floating]) -> None:
+    """cos(m * angle) and sin(m * angle), m = -lowest, ..., into the rows of `phases`."""
+    for k in range(phases.shape[1]):
+        phases[0, k] = np.cos((k - lowest) * angle)
+        phases[1, k] = np.sin((k - lowest) * angle)
+
+
+@numba.njit(cache=True, nogil=True)
+def _real_block(
+    j: int,
+    left: NDArray[np.floating],
+    right: NDArray[np.floating],
+    rows: NDArray[np.floating],
+    out: NDArray[np.floating],
+) -> None:
+    """Real (2j+1, 2j+1) matrix from the rows m >= 0 of d^j and the phases of alpha, gamma."""
+    root = np.sqrt(0.5)
+    for m in range(j + 1):
+        row_scale = (1.0 if m % 2 == 0 else -1.0) * (1.0 if m > 0 else root)
+        for n in range(j + 1):
+            plus = rows[m, ROW_MARGIN + j + n] * (1.0 if n % 2 == 0 else -1.0)
+            minus = rows[m, ROW_MARGIN + j - n]
+            scale = row_scale * (1.0 if n > 0 else root)
+            even, odd = scale * (plus + minus), scale * (plus - minus)
+            out[j + m, j + n] = even * left[0, m] * right[0, n] - odd * left[1, m] * right[1, n]
+            if n > 0:
+                out[j + m, j - n] = (
+                    -odd * left[1, m] * right[0, n] - even * left[0, m] * right[1, n]
+                )
+            if m > 0:
+                out[j - m, j + n] = (
+                    even * left[1, m] * right[0, n] + odd * left[0, m] * right[1, n]
+                )
+            if m > 0 and n > 0:
+                out[j - m, j - n] = (
+                    odd * left[0, m] * right[0, n] - even * left[1, m] * right[1, n]
+                )
+
+
+@numba.njit(cache=True, nogil=True)
+def _real_blocks(
+    rotations: NDArray[np.float64],
+    row_start: NDArray[np.int64],
+    recursion: NDArray[np.floating],
+    edge: NDArray[np.floating],
+    out: NDArray[np.floating],
+) -> None:
+    d = np.zeros(row_start[-1], recursion.dtype)
+    left = np.zeros((2, row_start.shape[0] - 1), recursion.dtype)
+    right = np.zeros((2, row_start.shape[0] - 1), recursion.dtype)
+    for i in range(rotations.shape[0]):
+        alpha, beta, gamma = euler_from_matrix(rotations[i])
+        fill_wigner_d(beta, row_start, recursion, edge, d)
+        fill_phases(alpha, 0, left)
+        fill_phases(gamma, 0, right)
+        offset = 0
+        for j in range(row_start.shape[0] - 1):
+            size = 2 * j + 1
+            rows = d[row_start[j] : row_start[j + 1]].reshape(j + 1, size + 2 * ROW_MARGIN)
+            block = out[i, offset : offset + size * size].reshape(size, size)
+            _real_block(j, left, right, rows, block)
+            offset += size * size
+
+
+def rotation_blocks(
+    rotations: ArrayLike, degree_limit: int, dtype: str = "float64"
+) -> NDArray[np.floating]:
+    r"""Real matrices :math:`\Delta^j(R)` of many rotations, all degrees, flat.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) array_like
+        Proper rotations, active.
+    degree_limit : int
+        Degrees 0 .. `degree_limit` - 1, at most 64.
+    dtype : {"float64", "float32"}
+        Of the result and of the recursion.
+
+    Returns
+    -------
+    (n, block_offsets(degree_limit)[-1]) floating
+        Row-major (2j+1, 2j+1) blocks, one degree after the other.
+
+    Raises
+    ------
+    ShapeError
+        If the shape is not (n, 3, 3).
+    InputError
+        If the degree limit is out of range.
+
+    Examples
+    --------
+    Degree 1 is the rotation itself, in the order (y, z, x):
+
+    >>> quarter_turn = np.array([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
+    >>> rotation_blocks(quarter_turn, 2)[0, 1:].reshape(3, 3).round(12) + 0.0
+    array([[ 0.,  0.,  1.],
+           [ 0.,  1.,  0.],
+           [-1.,  0.,  0.]])
+    """
+    if not 1 <= degree_limit <= 64:
+        raise InputError(f"degree_limit: expected 1 to 64, received {degree_limit}")
+    matrices = np.ascontiguousarray(rotations, dtype=np.float64)
+    check_shape("rotations", matrices, (None, 3, 3))
+    tables = degree_tables(degree_limit, dtype)
+    out = np.zeros((len(matrices), int(block_offsets(degree_limit)[-1])), dtype)
+    _real_blocks(matrices, tables.row_start, tables.recursion, tables.edge, out)
+    return out
+
+
+def rotate_coefficients(coefficients: ArrayLike, rotations: ArrayLike) -> NDArray[np.float64]:
+    r"""Coefficients of the turned functions :math:`f(R^T \omega)`.
+
+    Parameters
+    ----------
+    coefficients : (n, band_limit**2) or (band_limit**2,) array_like
+        Real harmonics, index ``ell * ell + ell + m``; one row serves all rotations.
+    rotations : (n, 3, 3) array_like
+        Proper rotations, active.
+
+    Returns
+    -------
+    (n, band_limit**2) float64
+
+    Raises
+    ------
+    ShapeError
+        If the last axis is not the square of a band limit.
+
+    Examples
+    --------
+    A half turn about z negates x and y:
+
+    >>> rotate_coefficients([0.0, 1.0, 2.0, 3.0], [np.diag([-1.0, -1.0, 1.0])]).round(12)
+    array([[ 0., -1.,  2., -3.]])
+    """
+    values = np.atleast_2d(np.asarray(coefficients, dtype=np.float64))
+    band_limit = round(np.sqrt(values.shape[1]))
+    check_shape("coefficients", values, (None, max(band_limit, 1) ** 2))
+    blocks = rotation_blocks(rotations, band_limit)
+    offsets = block_offsets(band_limit)
+    values = np.broadcast_to(values, (len(blocks), values.shape[1]))
+    parts = []
+    for j in range(band_limit):
+        size = 2 * j + 1
+        block = blocks[:, offsets[j] : offsets[j + 1]].reshape(-1, size, size)
+        parts.append(np.einsum("nij,nj->ni", block, values[:, j * j : (j + 1) ** 2]))
+    return np.concatenate(parts, axis=1)
