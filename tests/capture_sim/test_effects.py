@@ -1,0 +1,141 @@
+"""Each effect: when a scene calls for it, and what it does."""
+
+import numpy as np
+import pytest
+
+from capture_sim.effects import (
+    Workload,
+    antialiasing,
+    interreflection,
+    near_lights,
+    sensor_noise,
+    shadows,
+)
+from capture_sim.errors import SceneError
+from capture_sim.scene import NoiseOptions, parse_scene
+
+WORK = Workload(n_views=2, n_lights=3, n_pixels=100, n_points=40, n_lit=60)
+
+
+def scene(thing="sphere", kind="point", **tables):
+    return parse_scene(
+        {
+            "object": {"preset": thing},
+            "material": {"preset": "grey_card"},
+            "cameras": {"preset": "rti"},
+            "lights": {"preset": "rti", "kind": kind},
+            **tables,
+        }
+    )
+
+
+def test_a_convex_object_needs_no_shadow_rays():
+    assert shadows.needed(scene("sphere")) == (False, "a convex object cannot shadow itself")
+    assert shadows.cost(scene("sphere"), WORK).rays == 0
+    assert shadows.needed(scene("vase"))[0]
+    assert shadows.cost(scene("vase"), WORK).rays == 60
+
+
+@pytest.mark.parametrize(("mode", "traced"), [("on", True), ("off", False)])
+def test_shadows_can_be_forced(mode, traced):
+    for thing in ("sphere", "vase"):
+        simulated, reason = shadows.needed(scene(thing, effects={"shadows": mode}))
+        assert simulated is traced
+        assert "effects.shadows" in reason
+
+
+def test_distant_lights_need_no_directions_per_point():
+    assert near_lights.needed(scene(kind="point"))[0]
+    simulated, reason = near_lights.needed(scene(kind="directional"))
+    assert not simulated
+    assert "all lights are directional" in reason
+    assert near_lights.cost(scene(), WORK).operations == 40 * 3
+
+
+def test_interreflection_is_declared_missing():
+    assert interreflection.needed(scene("vase"))[1].startswith("not simulated")
+    assert "convex" in interreflection.needed(scene("sphere"))[1]
+
+
+def test_antialiasing_is_off_with_single_rays():
+    single = {"samples_per_side": 1, "edge_samples_per_side": 1}
+    assert not antialiasing.needed(scene(image=single))[0]
+    assert antialiasing.needed(scene())[0]
+    assert antialiasing.cost(scene(), WORK).rays == 100 * 16 + 40
+
+
+def test_spot_beam_falls_off_with_the_cosine_power():
+    spot = {
+        "id": "l0",
+        "type": "spot",
+        "position": [0, 0, 1],
+        "direction": [0, 0, -2],
+        "intensity": [8, 8, 8],
+        "exponent": 3,
+    }
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+    arriving = near_lights.illuminate((spot,), points)
+    # On the axis 8; at 45 degrees 8 / 2 * (1/sqrt 2)^3; behind the lamp nothing.
+    expected = [8.0, 4.0 / 2**1.5, 0.0]
+    np.testing.assert_allclose(arriving.irradiance[:, 0, 0], expected, rtol=1e-14)
+
+
+def test_far_point_light_tends_to_a_directional_one():
+    towards = np.array([0.6, 0.0, 0.8])
+    far = {
+        "id": "a",
+        "type": "point",
+        "position": (1e5 * towards).tolist(),
+        "intensity": [1e10] * 3,
+    }
+    sun = {"id": "b", "type": "directional", "direction": [3, 0, 4], "irradiance": [1, 1, 1]}
+    points = np.array([[0.1, -0.2, 0.05]])
+    both = near_lights.illuminate((far, sun), points)
+    # The parallax of 0.2 m at 100 km.
+    np.testing.assert_allclose(both.directions[:, 0], both.directions[:, 1], atol=5e-6)
+    np.testing.assert_allclose(both.irradiance[:, 0], both.irradiance[:, 1], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("light", "named"),
+    [
+        ({"id": "x", "type": "unknown"}, "'x': type: expected point, directional or spot"),
+        (
+            {"id": "s", "type": "spot", "position": [0, 0, 1], "direction": [0, 0, -1],
+             "intensity": [1, 1, 1], "cone_angle": 0.3},
+            "'s': exponent",
+        ),
+    ],
+)  # fmt: skip
+def test_lights_that_cannot_be_simulated_are_refused(light, named):
+    with pytest.raises(SceneError, match=named):
+        near_lights.illuminate((light,), np.zeros((1, 3)))
+
+
+def test_noise_has_the_variance_of_photons_and_reading():
+    radiance = np.full((120, 120, 3), 0.5, np.float32)
+    noise = NoiseOptions(electrons_per_radiance=400.0, read_noise=6.0)
+    errors = sensor_noise.add_noise(radiance, noise, (1, 2, 3)).astype(float) - 0.5
+    n = errors.size
+    variance = 0.5 / 400.0 + (6.0 / 400.0) ** 2
+    assert abs(errors.mean()) < 4 * np.sqrt(variance / n)  # 4 sigma of the mean
+    assert errors.var() == pytest.approx(
+        variance, rel=4 * np.sqrt(2 / n)
+    )  # and of the variance
+
+
+def test_noise_of_photographs_is_independent_and_repeatable():
+    radiance = np.ones((64, 64, 3), np.float32)
+    noise = NoiseOptions(electrons_per_radiance=100.0, read_noise=1.0)
+    first = sensor_noise.add_noise(radiance, noise, (1, 0, 0))
+    assert (first == sensor_noise.add_noise(radiance, noise, (1, 0, 0))).all()
+    other = sensor_noise.add_noise(radiance, noise, (1, 0, 1))
+    correlation = np.corrcoef(first.ravel(), other.ravel())[0, 1]
+    assert abs(correlation) < 4 / np.sqrt(first.size)  # 4 sigma
+
+
+def test_inner_edges_count_as_outlines():
+    face = np.array([[1, 2, 3, 4]] * 2)
+    distance = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.5, 1.5]], np.float32)
+    crossed = antialiasing.crossed_by_outline(face, distance, step=0.1)
+    assert crossed.tolist() == [False, True]

@@ -1,0 +1,61 @@
+"""Plans: the right counts, and costs that scale with the work."""
+
+from dataclasses import replace
+
+import pytest
+
+from capture_sim.plan import plan
+from capture_sim.scene import parse_scene
+
+
+def scene(thing, n_lights=3):
+    return parse_scene(
+        {
+            "name": "trial",
+            "object": {"preset": thing},
+            "material": {"preset": "grey_card"},
+            "cameras": {"preset": "fibonacci", "n": 4, "width": 24, "height": 24},
+            "lights": {"preset": "fibonacci", "n": n_lights},
+            "truth": {"points": 10},
+        }
+    )
+
+
+def test_counts_and_decisions():
+    decided = plan(scene("sphere"))
+    assert (decided.work.n_views, decided.work.n_lights) == (4, 3)
+    assert decided.work.n_photographs == 12
+    assert decided.work.n_pixels == 4 * 24 * 24
+    assert 0 < decided.work.n_lit < decided.work.n_points * 3
+    simulated = {effect.name: effect.simulated for effect in decided.effects}
+    assert simulated == {
+        "anti-aliasing": True,
+        "near lights": True,
+        "shadows": False,
+        "sensor noise": False,
+        "interreflection": False,
+    }
+    assert all(effect.reason for effect in decided.effects)
+
+
+def test_shadow_rays_are_counted():
+    decided = plan(scene("vase"))
+    costs = {effect.name: effect.cost.rays for effect in decided.effects}
+    assert costs["shadows"] == decided.work.n_lit
+    assert decided.rays == costs["shadows"] + costs["anti-aliasing"]
+
+
+def test_size_grows_with_the_number_of_photographs():
+    few, many = scene("sphere"), scene("sphere", n_lights=30)
+    few, many = (
+        replace(s, truth=replace(s.truth, points=0, per_view=False)) for s in (few, many)
+    )
+    ratio = plan(many).bytes / plan(few).bytes
+    assert ratio == pytest.approx(10, rel=0.5)  # some photographs are darker than others
+
+
+def test_lines_state_effects_and_reasons():
+    text = "\n".join(plan(scene("vase")).lines())
+    assert "12 (4 views, 3 lights)" in text
+    assert "yes  shadows          the object is not convex" in text
+    assert "no   interreflection  not simulated" in text

@@ -1,0 +1,298 @@
+"""Rendered photographs against hand-checkable values and independent renderers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture_sim import render
+from capture_sim.effects import near_lights
+from capture_sim.files import write_ply
+from capture_sim.rays import RayTracer, camera_rays, towards_camera
+from capture_sim.render import sample_view, shade
+from capture_sim.scene import EffectOptions, ImageOptions, parse_scene
+from capture_sim.surface import surface_points
+from capture_sim.truth import area_uniform_points, lights_visible
+
+ONE_RAY = ImageOptions(samples_per_side=1, edge_samples_per_side=1)
+
+
+def scene_of(thing, material, *, cameras=None, lights=None, **tables):
+    one_camera = {"preset": "list", "directions": [[1, -2, 1.5]]}
+    one_light = {"preset": "list", "directions": [[2, -1, 1.0]]}
+    rig = {
+        "cameras": {**one_camera, "width": 32, "height": 32, **(cameras or {})},
+        "lights": {**(lights if "preset" in (lights or {}) else one_light), **(lights or {})},
+    }
+    rig["lights"].setdefault("distance", 1.5)
+    return parse_scene({"object": thing, "material": material, **rig, **tables})
+
+
+def photographs(scene, camera=0):
+    tracer = RayTracer(scene.mesh)
+    return shade(scene, tracer, sample_view(scene, tracer, scene.cameras[camera]), scene.lights)
+
+
+def test_lambert_plane_follows_cosine_and_inverse_square(rounding):
+    scene = scene_of(
+        {"preset": "flat_sample", "size": [2.0, 2.0]},
+        {"type": "lambert", "albedo": [0.2, 0.5, 0.8]},
+        lights={
+            "preset": "list",
+            "directions": [[0.6, 0.0, 0.8]],
+            "intensity": [3.0, 2.0, 1.0],
+        },
+        cameras={"directions": [[0, 0, 1]], "extent": 0.5},
+    )
+    image = photographs(replace(scene, image=ONE_RAY))[0]
+    # Pixel pitch 0.5 m / 32 at the plane; image x is world x, image y is world -y.
+    ticks = (np.arange(32) - 15.5) * 0.5 / 32
+    x, y = np.meshgrid(ticks, -ticks)
+    light = 1.5 * np.array([0.6, 0.0, 0.8])
+    distance2 = (light[0] - x) ** 2 + (light[1] - y) ** 2 + light[2] ** 2
+    cosine = light[2] / np.sqrt(distance2)
+    facing = np.array([3.0, 2.0, 1.0]) / distance2[..., None]
+    expected = np.array([0.2, 0.5, 0.8]) / np.pi * cosine[..., None] * facing
+    # Hits come from float32 rays; their error moves the point by about eps * distance.
+    np.testing.assert_allclose(image, expected, rtol=rounding(np.float32, operations=4))
+
+
+def test_coverage_of_a_disc_is_its_area():
+    scene = scene_of(
+        {"preset": "sphere", "radius": 0.1, "around": 512},
+        {"preset": "grey_card"},
+        cameras={"directions": [[0, 0, 1]], "model": "orthographic", "extent": 0.25},
+        image={"edge_samples_per_side": 8},
+    )
+    coverage = sample_view(scene, RayTracer(scene.mesh), scene.cameras[0]).coverage
+    pixels_per_metre = 32 / 0.25
+    ticks = (np.arange(32) + 0.5 - 16) / pixels_per_metre
+    distance = np.hypot(*np.meshgrid(ticks, ticks))
+    assert (coverage[distance < 0.1 - 1 / pixels_per_metre] == 1.0).all()
+    assert (coverage[distance > 0.1 + 1 / pixels_per_metre] == 0.0).all()
+    # A pixel that the outline crosses is wrong by about a tenth of a row of rays, 1/80;
+    # there are 8 r of them with independent errors: 4 sigma.
+    tolerance = 4 * np.sqrt(8 * 0.1 * pixels_per_metre) / 80
+    assert coverage.sum() == pytest.approx(np.pi * (0.1 * pixels_per_metre) ** 2, abs=tolerance)
+
+
+def test_pixels_at_the_outline_hold_their_share_of_the_light():
+    scene = scene_of(
+        {"preset": "flat_sample", "size": [0.1, 0.1]},
+        {"type": "lambert", "albedo": 1.0},
+        cameras={"directions": [[0, 0, 1]], "model": "orthographic", "extent": 0.3},
+        lights={"preset": "list", "kind": "directional", "directions": [[0, 0, 1]]},
+    )
+    view = sample_view(scene, RayTracer(scene.mesh), scene.cameras[0])
+    image = photographs(scene)[0, ..., 0]
+    assert ((view.coverage > 0) & (view.coverage < 1)).any()
+    # Irradiance pi on a white plane gives radiance 1, so the image equals the coverage.
+    np.testing.assert_allclose(image, view.coverage, rtol=1e-6)  # float32 sums of 16 parts
+
+
+def brute_force_blocked(mesh, origins, targets):
+    """Moeller-Trumbore on every face, float64."""
+    corner, along, up = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    along, up = along - corner, up - corner
+    blocked = np.zeros(len(origins), bool)
+    for i, (origin, target) in enumerate(zip(origins, targets, strict=True)):
+        direction = target - origin
+        p = np.cross(direction, up)
+        determinant = np.einsum("fc,fc->f", along, p)
+        safe = np.where(np.abs(determinant) > 1e-18, determinant, np.inf)
+        offset = origin - corner
+        u = np.einsum("fc,fc->f", offset, p) / safe
+        q = np.cross(offset, along)
+        v = q @ direction / safe
+        t = np.einsum("fc,fc->f", up, q) / safe
+        blocked[i] = ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1)).any()
+    return blocked
+
+
+def test_shadows_agree_with_brute_force():
+    scene = scene_of(
+        {"preset": "amphora", "around": 24, "along": 24},
+        {"preset": "grey_card"},
+        lights={"preset": "fibonacci", "n": 8},
+        truth={"points": 250},
+    )
+    tracer = RayTracer(scene.mesh)
+    points = area_uniform_points(scene, np.random.default_rng(3))
+    visible = lights_visible(scene, tracer, points)
+    positions = np.array([light["position"] for light in scene.lights])
+    starts = points.start + tracer.start_offset * points.face_normal
+    directions = near_lights.illuminate(scene.lights, points.position).directions
+    above = np.einsum("nlj,nj->nl", directions, points.shading_from_world[:, 2]) > 0
+    reached = np.stack(
+        [
+            ~brute_force_blocked(scene.mesh, starts, np.broadcast_to(p, starts.shape))
+            for p in positions
+        ],
+        axis=1,
+    )
+    assert 0.05 < (above & ~reached).mean() < 0.9  # the object does shadow itself
+    # Rays through an edge may fall to either side in float32: at most 2 in 1000.
+    assert (visible != (above & reached)).mean() <= 2e-3
+
+
+def test_tracing_a_convex_object_changes_nothing():
+    scene = scene_of(
+        {"preset": "sphere", "around": 48},
+        {"preset": "grey_card"},
+        image={"samples_per_side": 1},
+    )
+    untraced = photographs(scene)
+    traced = photographs(replace(scene, effects=EffectOptions(shadows="on")))
+    # Rays start on the smooth surface, so the facets draw no line along the terminator.
+    np.testing.assert_allclose(traced, untraced, atol=2e-3 * untraced.max())
+
+
+def test_blocks_do_not_change_the_picture(monkeypatch, rounding):
+    scene = scene_of(
+        {"preset": "vase"}, {"preset": "painted_vase"}, lights={"preset": "rti", "n": 5}
+    )
+    whole = photographs(scene)
+    monkeypatch.setattr(render, "PAIRS_PER_BLOCK", 700)
+    monkeypatch.setattr(render, "RAYS_PER_BLOCK", 900)
+    np.testing.assert_allclose(
+        photographs(scene), whole, rtol=rounding(np.float32), atol=rounding(np.float32)
+    )
+
+
+def test_radiance_is_linear_in_the_light(rounding):
+    scene = scene_of({"preset": "vase"}, {"preset": "glazed_ceramic"})
+    brighter = tuple(
+        {**light, "intensity": [4 * i for i in light["intensity"]]} for light in scene.lights
+    )
+    ratio_4 = photographs(replace(scene, lights=brighter))
+    np.testing.assert_allclose(ratio_4, 4 * photographs(scene), rtol=rounding(np.float32))
+
+
+def test_lens_distortion_bends_rays_as_opencv_projects(rng):
+    import cv2
+
+    terms = {"k1": -0.2, "k2": 0.05, "p1": 0.002, "p2": -0.001, "k3": 0.01, "k4": 0.1}
+    camera = {
+        "id": "v0",
+        "model": "opencv",
+        "w": 100,
+        "h": 80,
+        "fl_x": 90.0,
+        "fl_y": 95.0,
+        "cx": 51.0,
+        "cy": 39.0,
+        "camera_from_world": np.eye(4).tolist(),
+        **terms,
+    }
+    pixels = rng.uniform([0, 0], [100, 80], (50, 2))
+    origins, directions = camera_rays(camera, pixels)
+    matrix = np.array([[90.0, 0, 51], [0, 95.0, 39], [0, 0, 1]])
+    lens = np.array([-0.2, 0.05, 0.002, -0.001, 0.01, 0.1, 0.0, 0.0])
+    again, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, lens)
+    assert not origins.any()
+    np.testing.assert_allclose(
+        again[:, 0], pixels, atol=1e-6
+    )  # 1e-12 of undistortion, times focal
+
+
+# ------------------------------------------------------------------ independent renderer
+
+METAL = {"type": "ggx", "eta": 0.0, "kappa": 1.0, "specular": [0.9, 0.6, 0.3],
+         "alpha_x": 0.15, "alpha_y": 0.4, "correlated": False}  # fmt: skip
+BSDFS = {
+    "diffuse": (
+        {"type": "lambert", "albedo": [0.7, 0.4, 0.2]},
+        {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}},
+    ),
+    "brushed": (
+        METAL,
+        {
+            "type": "roughconductor",
+            "material": "none",
+            "distribution": "ggx",
+            "alpha_u": 0.15,
+            "alpha_v": 0.4,
+            "specular_reflectance": {"type": "rgb", "value": [0.9, 0.6, 0.3]},
+        },
+    ),
+}
+
+
+def with_tangents_per_face(mesh):
+    """The same surface with each face's own dP/du, which Mitsuba shades with."""
+    corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
+    du, dv = np.moveaxis(uv[:, 1:] - uv[:, :1], 2, 0)
+    edges = corners[:, 1:] - corners[:, :1]
+    area = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
+    tangent = (dv[:, 1:] * edges[:, 0] - dv[:, :1] * edges[:, 1]) / area[:, None]
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return replace(
+        mesh,
+        vertices=corners.reshape(-1, 3),
+        faces=np.arange(corners.shape[0] * 3, dtype=np.int32).reshape(-1, 3),
+        uv=uv.reshape(-1, 2),
+        normals=mesh.normals[mesh.faces].reshape(-1, 3),
+        tangents=np.repeat(tangent, 3, axis=0),
+    )
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("kind", BSDFS)
+def test_point_light_matches_mitsuba(kind, tmp_path):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    ours, theirs = BSDFS[kind]
+    scene = scene_of(
+        {"preset": "vase", "around": 64, "along": 48},
+        ours,
+        cameras={"target": [0, 0, 0.1]},
+        lights={"distance": 0.5, "intensity": [2.0, 3.0, 4.0]},
+    )
+    scene = replace(scene, mesh=with_tangents_per_face(scene.mesh), image=ONE_RAY)
+    image = photographs(scene)[0].reshape(-1, 3)
+
+    write_ply(tmp_path / "mesh.ply", scene.mesh)
+    light = scene.lights[0]
+    world = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
+            "mesh": {"type": "ply", "filename": str(tmp_path / "mesh.ply"), "bsdf": theirs},
+            "light": {
+                "type": "point",
+                "position": light["position"],
+                "intensity": {"type": "rgb", "value": light["intensity"]},
+            },
+        }
+    )
+    sampler = mi.load_dict({"type": "independent"})
+    grid = np.stack(np.meshgrid(np.arange(32), np.arange(32)), axis=-1).reshape(-1, 2) + 0.5
+    rays = zip(*camera_rays(scene.cameras[0], grid), strict=True)
+    reference = np.array(
+        [
+            np.array(
+                world.integrator().sample(world, sampler, mi.RayDifferential3f(mi.Ray3f(o, d)))[
+                    0
+                ]
+            )
+            for o, d in rays
+        ]
+    )
+    same = np.isclose(image, reference, rtol=1e-3, atol=1e-4 * reference.max()).all(axis=1)
+    assert (reference > 0).any(axis=1).sum() > 100
+    # Where they differ it is whether a facet at the terminator or behind an edge is lit.
+    assert (~same).sum() <= 2
+    error = np.linalg.norm((image - reference)[same]) / np.linalg.norm(reference[same])
+    assert error < 2e-5  # float32 rays on both sides; 6e-6 to 9e-6 were measured
+
+
+def test_view_directions_meet_the_camera(rng, rounding):
+    scene = scene_of({"preset": "sphere"}, {"preset": "grey_card"})
+    camera = scene.cameras[0]
+    faces = rng.integers(len(scene.mesh.faces), size=20)
+    points = surface_points(scene.mesh, scene.material, faces, np.full((20, 3), 1 / 3))
+    towards = towards_camera(camera, points.position)
+    centre = np.array([1, -2, 1.5]) / np.linalg.norm([1, -2, 1.5])
+    np.testing.assert_allclose(
+        np.cross(towards, centre - points.position), 0.0, atol=rounding(np.float64)
+    )

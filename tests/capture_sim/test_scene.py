@@ -1,0 +1,105 @@
+"""Scene files: what is accepted, and how mistakes are reported."""
+
+import numpy as np
+import pytest
+
+from capture_sim.errors import SceneError
+from capture_sim.scene import find_scene, load_scene, parse_scene, shipped_scenes
+
+
+def tables(**changed):
+    good = {
+        "object": {"preset": "sphere"},
+        "material": {"preset": "grey_card"},
+        "cameras": {"preset": "rti"},
+        "lights": {"preset": "rti", "n": 3},
+    }
+    return {**good, **changed}
+
+
+def test_defaults():
+    scene = parse_scene(tables(), default_name="ball")
+    assert (scene.name, scene.base_geometry, scene.heldout_frames) == ("ball", "hull", 0)
+    assert (scene.image.samples_per_side, scene.image.edge_samples_per_side) == (2, 4)
+    assert scene.effects.sensor_noise is None
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"colour": 1}, r"scene: expected keys .*base_geometry.*, received 'colour'; remove"),
+        ({"seed": -1}, r"scene\.seed: expected a whole number"),
+        ({"seed": True}, r"scene\.seed"),
+        ({"name": 3}, r"scene\.name: expected one line of text, received 3"),
+        ({"base_geometry": "round"}, r"scene\.base_geometry: expected one of hull, plane"),
+        (
+            {"object": "vase"},
+            r"scene\.object: expected a table, received vase; write a \[object\]",
+        ),
+        ({"object": {"preset": "cup"}}, r"object\.preset: expected one of .*vase"),
+        ({"material": {"preset": "mud"}}, r"material\.preset"),
+        ({"cameras": {"preset": "rti", "zoom": 2}}, r"cameras: expected keys .*'zoom'"),
+        ({"image": {"samples_per_side": 0}}, r"image\.samples_per_side: .*received 0"),
+        ({"image": {"samples": 4}}, r"image: expected keys .*samples_per_side.*'samples'"),
+        ({"effects": {"shadows": "maybe"}}, r"effects\.shadows: expected one of auto, on, off"),
+        ({"effects": {"sensor_noise": {}}}, r"electrons_per_radiance: expected a value"),
+        (
+            {"effects": {"sensor_noise": {"electrons_per_radiance": 1, "read_noise": -1}}},
+            r"read_noise: expected a number",
+        ),
+        ({"heldout": {"frames": -2}}, r"heldout\.frames"),
+        ({"truth": {"per_view": 1}}, r"truth\.per_view: expected true or false"),
+    ],
+)
+def test_mistakes_name_the_key(changed, named):
+    with pytest.raises(SceneError, match=named):
+        parse_scene(tables(**changed))
+
+
+@pytest.mark.parametrize("key", ["object", "material", "cameras", "lights"])
+def test_missing_tables_are_named(key):
+    incomplete = tables()
+    del incomplete[key]
+    with pytest.raises(SceneError, match=rf"scene\.{key}: expected a value, received nothing"):
+        parse_scene(incomplete)
+
+
+def test_heldout_frames_need_a_perspective_camera():
+    orthographic = {"preset": "rti", "model": "orthographic"}
+    with pytest.raises(SceneError, match=r"heldout\.frames: expected 0 for cameras other"):
+        parse_scene(tables(cameras=orthographic, heldout={"frames": 1}))
+
+
+def test_textures_need_coordinates(tmp_path):
+    (tmp_path / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    bare = {"type": "mesh", "file": "bare.obj"}
+    assert not parse_scene(tables(object=bare), folder=tmp_path).mesh.has_uv
+    with pytest.raises(SceneError, match="texture coordinates, which the material needs"):
+        parse_scene(tables(object=bare, material={"preset": "greek_key"}), folder=tmp_path)
+
+
+def test_files_are_named_in_messages(tmp_path):
+    broken = tmp_path / "broken.toml"
+    broken.write_text("[object\n")
+    with pytest.raises(SceneError, match=r"broken\.toml: expected a TOML file"):
+        load_scene(str(broken))
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("shine = 1\n[object]\npreset = 'sphere'\n")
+    with pytest.raises(SceneError, match=r"wrong\.toml: scene\.material"):
+        load_scene(str(wrong))
+
+
+def test_unknown_scenes_list_the_shipped_ones():
+    with pytest.raises(SceneError, match=r"one of demo_vase, .*received 'nothing_like_it'"):
+        find_scene("nothing_like_it")
+
+
+@pytest.mark.parametrize("name", shipped_scenes())
+def test_shipped_scenes_load_and_see_their_object(name):
+    scene = load_scene(name)
+    assert scene.name == name
+    assert scene.description
+    for camera in scene.cameras:
+        pose = np.array(camera["camera_from_world"])
+        position = pose[:3, :3] @ scene.mesh.centre + pose[:3, 3]
+        assert position[2] > 0 or camera["model"] == "orthographic"
