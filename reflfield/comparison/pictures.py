@@ -62,9 +62,9 @@ def exposure_for(image: ArrayLike, shown: ArrayLike, percentile: float = 99.5) -
 
     Parameters
     ----------
-    image : (h, w, 3) array_like
+    image : (..., 3) array_like
         Linear radiance.
-    shown : (h, w) array_like of bool
+    shown : (...) array_like of bool
         True where the picture has content.
     percentile : float
         0 to 100.
@@ -278,6 +278,19 @@ def silhouettes_overlay(
     return painted
 
 
+def with_alpha(picture: Encoded, shown: ArrayLike) -> Encoded:
+    """The picture with a fourth channel, transparent where not `shown`.
+
+    Examples
+    --------
+    >>> with_alpha(np.full((1, 2, 3), 7, np.uint8), [[True, False]])[0].tolist()
+    [[7, 7, 7, 255], [0, 0, 0, 0]]
+    """
+    opaque = np.asarray(shown, dtype=bool)
+    alpha = np.where(opaque, 255, 0).astype(np.uint8)
+    return np.dstack([np.where(opaque[..., None], picture, 0).astype(np.uint8), alpha])
+
+
 def bounding_box(covered: ArrayLike, margin: int = 4) -> tuple[slice, slice]:
     """Rows and columns that hold all True pixels and a margin around them.
 
@@ -316,6 +329,17 @@ def fitted(picture: Encoded, max_side: int) -> Encoded:
         return picture
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(PillowImage.fromarray(picture).resize(size, PillowImage.Resampling.BOX))
+
+
+def enlarged(picture: NDArray[Any], factor: int) -> NDArray[Any]:
+    """Every pixel repeated `factor` times in both directions.
+
+    Examples
+    --------
+    >>> enlarged(np.array([[1, 2]]), 2).tolist()
+    [[1, 1, 2, 2], [1, 1, 2, 2]]
+    """
+    return np.repeat(np.repeat(picture, factor, axis=0), factor, axis=1)
 
 
 def row_of(pictures: Sequence[Encoded], gap: int = 4, colour: Colour = NOTHING) -> Encoded:

@@ -84,7 +84,7 @@ class Truth:
 
     def view(self, camera_id: str) -> TruthView:
         """What the camera of this name truly sees."""
-        path = _inside(self.root, f"truth/views/{camera_id}.npz")
+        path = self._view_path(camera_id)
         with np.load(_existing(path), allow_pickle=False) as arrays:
             missing = [n for n in TruthView.__annotations__ if n not in arrays]
             if missing:
@@ -93,7 +93,7 @@ class Truth:
 
     def has_view(self, camera_id: str) -> bool:
         """Whether the truth of this camera's pixels was written."""
-        return _inside(self.root, f"truth/views/{camera_id}.npz").is_file()
+        return self._view_path(camera_id).is_file()
 
     def heldout(self) -> Path | None:
         """The frames file of unseen views and lights, if there is one."""
@@ -112,6 +112,10 @@ class Truth:
         """File that ``truth.json`` names under a key, inside the capture."""
         named = self.description.get(key, default)
         return _inside(self.root, named if isinstance(named, str) else default)
+
+    def _view_path(self, camera_id: str) -> Path:
+        pattern = self.description.get("views", "truth/views/{camera}.npz")
+        return _inside(self.root, str(pattern).replace("{camera}", camera_id))
 
 
 def open_truth(root: Path | str) -> Truth | None:

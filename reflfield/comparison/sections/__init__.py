@@ -1,0 +1,45 @@
+"""The usual sections of a report, from plain arrays and counts.
+
+Every builder returns a `Section`; the pipeline composes them in its order and
+leaves out those whose input a run does not have.
+"""
+
+from reflfield.comparison.sections.frames import (
+    alignment_section,
+    comparisons_table,
+    frames_section,
+    metrics_table,
+)
+from reflfield.comparison.sections.run import (
+    StageRecord,
+    compression_section,
+    key_numbers,
+    run_section,
+    stages_section,
+)
+from reflfield.comparison.sections.surface import (
+    SilhouetteView,
+    atlas_section,
+    coverage_section,
+    normals_section,
+    silhouettes_section,
+)
+from reflfield.comparison.sections.truth import truth_section
+
+__all__ = [
+    "SilhouetteView",
+    "StageRecord",
+    "alignment_section",
+    "atlas_section",
+    "comparisons_table",
+    "compression_section",
+    "coverage_section",
+    "frames_section",
+    "key_numbers",
+    "metrics_table",
+    "normals_section",
+    "run_section",
+    "silhouettes_section",
+    "stages_section",
+    "truth_section",
+]

@@ -1,0 +1,266 @@
+"""Sections on pictures: held-out frames and what alignment brings to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.comparison import pictures, plots
+from reflfield.comparison.metrics import (
+    COVERAGE_OF_OBJECT,
+    PSNR_CAP_DB,
+    Comparison,
+    FrameMetrics,
+    FramePair,
+    flip_map,
+    object_pixels,
+    without_backdrop,
+    worst_to_best,
+)
+from reflfield.comparison.report import (
+    ColourBar,
+    Figure,
+    Item,
+    Note,
+    Panel,
+    Picture,
+    Section,
+    Table,
+    encode_picture,
+    format_bytes,
+)
+from reflfield.comparison.tonemapping import display
+
+ROW_PX = 480
+# FLIP errors of good results lie near 0; full scale would show black pictures.
+FLIP_SCALES = (0.1, 0.2, 0.3, 0.5, 1.0)
+FLIP_LABEL = "FLIP error, all rows: 0 is not distinguishable"
+METRIC_HEADER = ("PSNR LDR, dB", "PSNR HDR, dB", "SSIM", "FLIP")
+
+
+def frames_section(
+    comparison: Comparison,
+    pairs: Iterable[FramePair],
+    *,
+    title: str = "Held-out frames",
+    intro: str = "Photographs that the field has never seen, beside what it predicts for them.",
+    max_rows: int = 8,
+) -> Section:
+    """Rows photograph | relit | error, and the table of metrics per frame.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of the same frames.
+    pairs : iterable of FramePair
+        Read once, one at a time; frames that are not shown are skipped.
+    title, intro : str
+    max_rows : int
+        Rows shown, from the worst frame to the best in even steps.
+
+    Returns
+    -------
+    Section
+    """
+    shown = {f.name: f for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
+    rows = [
+        _compared(pair, shown[pair.name], comparison.exposure)
+        for pair in pairs
+        if pair.name in shown
+    ]
+    rows.sort(key=lambda row: (-row.metrics.flip, row.metrics.name))
+    high = _flip_scale([row.error for row in rows])
+    items: list[Item] = [_notes_on(comparison)]
+    items += [_row_figure(row, high, has_bar=i == 0) for i, row in enumerate(rows)]
+    items += [_distribution(comparison), metrics_table(comparison)]
+    return Section(title, intro, tuple(items))
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    metrics: FrameMetrics
+    photograph: Picture
+    relit: Picture
+    error: NDArray[np.float64]
+
+
+def _compared(pair: FramePair, metrics: FrameMetrics, exposure: float) -> _Row:
+    box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
+    photograph, relit = (
+        encode_picture(pictures.fitted(pictures.tonemapped(image[box], exposure), ROW_PX))
+        for image in (np.asarray(pair.photograph), np.asarray(pair.relit))
+    )
+    error = flip_map(*(display(image, exposure) for image in without_backdrop(pair)))
+    counted = object_pixels(pair.silhouette)
+    return _Row(metrics, photograph, relit, np.where(counted, error, np.nan)[box])
+
+
+def _flip_scale(errors: Sequence[NDArray[np.float64]]) -> float:
+    tops = [float(np.nanpercentile(error, 99)) for error in errors]
+    top = max(tops, default=1.0)
+    return next((scale for scale in FLIP_SCALES if scale >= top), FLIP_SCALES[-1])
+
+
+def _row_figure(row: _Row, high: float, *, has_bar: bool) -> Figure:
+    m = row.metrics
+    coloured = pictures.false_colour(row.error, 0, high, "magma")
+    error = pictures.fitted(pictures.with_alpha(coloured, np.isfinite(row.error)), ROW_PX)
+    return Figure(
+        (
+            Panel(row.photograph, "photograph"),
+            Panel(row.relit, "relit"),
+            Panel(encode_picture(error, lossless=True), f"FLIP error, 0 to {high:g}"),
+        ),
+        f"PSNR {m.psnr_ldr:.2f} dB (HDR {m.psnr_hdr:.2f} dB) · SSIM {m.ssim:.3f} · "
+        f"FLIP {m.flip:.3f} · {m.n_pixels} object pixels",
+        title=m.name,
+        colour_bar=ColourBar("magma", 0.0, high, FLIP_LABEL) if has_bar else None,
+        min_width=0,
+    )
+
+
+def _notes_on(comparison: Comparison) -> Note:
+    ratio = " / ".join("–" if r is None else f"{r:.3f}" for r in comparison.colour_ratio)
+    return Note(
+        f"All pictures at one exposure, {comparison.exposure:.4g}; nothing is rescaled per "
+        "picture. Rows go from the worst frame to the best. Look for missing or smeared "
+        "highlights, shadows with soft or displaced edges, and double contours. Brightness "
+        f"relit / photograph, mean over frames, R / G / B: {ratio} (1 is without bias)."
+    )
+
+
+def _distribution(comparison: Comparison) -> Figure:
+    ranked = {
+        "PSNR LDR": sorted(f.psnr_ldr for f in comparison.frames),
+        "PSNR HDR": sorted(f.psnr_hdr for f in comparison.frames),
+    }
+    curves = {name: (range(1, len(v) + 1), v) for name, v in ranked.items()}
+    flips = {"FLIP": [f.flip for f in comparison.frames]}
+    return Figure(
+        (
+            Panel(plots.lines(curves, "frames, worst first", "PSNR, dB"), "PSNR, sorted"),
+            Panel(
+                plots.histogram(flips, "FLIP", "frames, %", n_bins=20), "distribution of FLIP"
+            ),
+        ),
+        "A few frames far below the rest usually share a light or a view: see the table.",
+        min_width=300,
+    )
+
+
+def metrics_table(comparison: Comparison) -> Table:
+    """Metrics of every frame, and their mean on top.
+
+    Parameters
+    ----------
+    comparison : Comparison
+
+    Returns
+    -------
+    Table
+    """
+    mean = comparison.mean
+    rows = [("mean", *_metric_cells(mean), mean["n_pixels"])]
+    rows += [
+        (f.name, *_metric_cells(vars(f)), float(f.n_pixels))
+        for f in worst_to_best(comparison.frames)
+    ]
+    return Table(
+        ("frame", *METRIC_HEADER, "object pixels"),
+        tuple(rows),
+        "Metrics per frame over object pixels, worst FLIP first. PSNR ends at "
+        f"{PSNR_CAP_DB:g} dB (equal pictures).",
+        emphasised=(0,),
+    )
+
+
+def _metric_cells(metrics: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    decimals = (("psnr_ldr", 2), ("psnr_hdr", 2), ("ssim", 4), ("flip", 4))
+    red, green, blue, last = (f"{metrics[key]:.{places}f}" for key, places in decimals)
+    return red, green, blue, last
+
+
+def _even_choice(frames: Sequence[FrameMetrics], count: int) -> list[FrameMetrics]:
+    if len(frames) <= count:
+        return list(frames)
+    ranks = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    return [frames[rank] for rank in ranks]
+
+
+def alignment_section(
+    history: ArrayLike,
+    margin: ArrayLike,
+    ablation: Mapping[str, Comparison] | None = None,
+    *,
+    file_bytes: Mapping[str, int] | None = None,
+) -> Section:
+    """Alignment: progress of the score, how determined it is, what it brings.
+
+    Parameters
+    ----------
+    history : (n_iterations,) array_like
+        Accumulated correlation after each iteration.
+    margin : (n_texels,) array_like
+        Score gap to the next distinct peak; near 0 is not determined.
+    ablation : mapping of name to Comparison, optional
+        Such as "with alignment", "without alignment", on the same frames.
+    file_bytes : mapping of name to int, optional
+        Size of the field file of each variant.
+
+    Returns
+    -------
+    Section
+    """
+    scores = np.asarray(history, dtype=np.float64).ravel()
+    figure = Figure(
+        (
+            Panel(
+                plots.lines(
+                    {"correlation": (np.arange(1, scores.size + 1), scores)},
+                    "iteration",
+                    "accumulated correlation",
+                ),
+                "score by iteration",
+            ),
+            Panel(plots.histogram({"margin": margin}, "margin", "texels, %"), "margin"),
+        ),
+        "The score must never fall, and should level off. Texels at margin 0 have no "
+        "orientation of their own (matte or isotropic materials) and keep the hull's.",
+        min_width=300,
+    )
+    items: list[Item] = [figure]
+    if ablation:
+        items.append(comparisons_table(ablation, file_bytes))
+    intro = "One local frame per texel, found by correlating apparent BRDFs over all rotations."
+    return Section("Alignment", intro, tuple(items))
+
+
+def comparisons_table(
+    variants: Mapping[str, Comparison], file_bytes: Mapping[str, int] | None = None
+) -> Table:
+    """Mean metrics of variants of one result, on the same frames.
+
+    Parameters
+    ----------
+    variants : mapping of name to Comparison
+    file_bytes : mapping of name to int, optional
+
+    Returns
+    -------
+    Table
+    """
+    sizes = file_bytes or {}
+    rows = tuple(
+        (name, *_metric_cells(c.mean), format_bytes(sizes[name]) if name in sizes else None)
+        for name, c in variants.items()
+    )
+    return Table(
+        ("variant", *METRIC_HEADER, "size"),
+        rows,
+        "Mean over the held-out frames: higher PSNR and SSIM and lower FLIP are better, at "
+        "equal or smaller size.",
+    )

@@ -1,0 +1,126 @@
+"""Section builders: the numbers they print, and input that lacks something."""
+
+import numpy as np
+import pytest
+
+from reflfield.comparison import plots, sections
+from reflfield.comparison.metrics import compare_frames
+from reflfield.comparison.report import Figure, ReportContent, Table, render_report
+
+
+def tables(section):
+    return [item for item in section.items if isinstance(item, Table)]
+
+
+def test_rows_run_from_worst_to_best_and_skip_the_rest(rng, samples):
+    pairs = samples.frame_pairs(rng, count=7, size=24)
+    comparison = compare_frames(pairs)
+    section = sections.frames_section(comparison, iter(pairs), max_rows=3)
+    titles = [item.title for item in section.items if isinstance(item, Figure) and item.title]
+    # Noise grows with the number.
+    assert titles == ["heldout_006", "heldout_003", "heldout_000"]
+    (table,) = tables(section)
+    assert [row[0] for row in table.rows] == [
+        "mean",
+        *(f"heldout_00{i}" for i in range(6, -1, -1)),
+    ]
+    assert table.rows[0][1] == f"{comparison.mean['psnr_ldr']:.2f}"
+
+
+def test_silhouette_agreement_is_counted():
+    silhouette, hull = np.zeros((20, 20)), np.zeros((20, 20))
+    silhouette[:, :10], hull[:, 5:15] = 1, 1
+    photograph = np.ones((20, 20, 3))
+    section = sections.silhouettes_section(
+        [
+            sections.SilhouetteView("good", photograph, silhouette, silhouette),
+            sections.SilhouetteView("bad", photograph, silhouette, hull),
+        ],
+        max_pictures=1,
+    )
+    assert tables(section)[0].rows == (
+        ("bad", "0.3333", "50.00", "50.00"),
+        ("good", "1.0000", "0.00", "0.00"),
+    )
+    assert [panel.label for panel in section.items[0].panels] == ["bad · IoU 0.333"]
+
+
+def test_compression_ratio_and_shares():
+    section = sections.compression_section({"a": 750, "b": 250}, 8000)
+    assert "8 times smaller" in section.intro
+    assert tables(section)[0].rows[0] == ("a", "750 B", "75.0 %")
+
+
+def test_turned_frames_show_their_tilt(samples):
+    texels, charts = samples.atlas(32)
+    base = np.broadcast_to(np.eye(3), (len(charts), 3, 3))
+    c, s = np.cos(0.2), np.sin(0.2)
+    tilted = np.array([[1, 0, 0], [0, c, s], [0, -s, c]]) @ base
+    section = sections.normals_section(texels, tilted, base)
+    # The scale ends at the 99th percentile, here the one tilt that there is.
+    assert section.items[1].colour_bar.high == pytest.approx(np.degrees(0.2), rel=1e-12)
+
+
+def test_stage_times_add_up_and_reuse_is_said():
+    section = sections.stages_section(
+        [
+            sections.StageRecord("hull", 61.0, inputs={"views": 32}, outputs={"faces": 20_000}),
+            sections.StageRecord("atlas", 4.0, peak_bytes=10**9, reused=True),
+        ]
+    )
+    rows = tables(section)[0].rows
+    assert rows[0] == ("hull", "1 min 01 s", None, "32 views", "20\u202f000 faces", None)
+    assert rows[1][:3] == ("atlas (reused)", "4.0 s", "1 GB")
+    assert rows[2][1] == "1 min 05 s"
+
+
+@pytest.mark.stability
+def test_degenerate_input_still_makes_a_page(rng, samples):
+    """One frame, no texel seen, nothing known: a page all the same."""
+    texels, charts = samples.atlas(16)
+    n = len(charts)
+    frames = np.broadcast_to(np.eye(3), (n, 3, 3))
+    pair = samples.frame_pairs(rng, count=1, size=24)
+    empty = np.zeros((24, 24))
+    page = render_report(
+        ReportContent(
+            "empty",
+            key_numbers=sections.key_numbers(),
+            sections=(
+                sections.frames_section(compare_frames(pair), pair),
+                sections.silhouettes_section(
+                    [
+                        sections.SilhouetteView(
+                            "v", pair[0].photograph, empty, samples.disk(24, 5)
+                        )
+                    ]
+                ),
+                sections.silhouettes_section([]),
+                sections.atlas_section(texels, charts, np.full((n, 3), np.nan)),
+                sections.coverage_section(texels, np.zeros(n, int), np.zeros(n, int)),
+                sections.normals_section(texels, frames, frames),
+                sections.alignment_section([], np.full(n, np.nan)),
+                sections.truth_section(),
+                sections.compression_section({}, 0),
+                sections.stages_section([]),
+                sections.run_section({}, {}),
+            ),
+        )
+    )
+    assert page.count("<section") == 11
+
+
+def test_plots_are_the_same_bytes_each_time_and_carry_no_date():
+    first, second = (
+        plots.lines({"$a$ <b>": ([1, 2], [1.0, np.nan])}, "x", "y", log_y=True)
+        for _ in range(2)
+    )
+    assert first == second
+    assert b"dc:date" not in first.data
+
+
+def test_histogram_counts_everything_in_percent():
+    # 3 of 4 finite values in the first half; the far one counts in the last bin.
+    picture = plots.histogram({"a": [0.1, 0.2, 0.3, 9.0, np.nan]}, "x", "y", limits=(0, 1))
+    assert picture.is_plot
+    assert (picture.width, picture.height) == (538, 298)
