@@ -14,16 +14,13 @@ from reflfield.factorization.recursive import (
     Fit,
     Model,
     RowStatistics,
-    floored,
     gram_of_samples,
     infer,
     resolve_final,
     resolve_online,
-    weighted,
     with_moments,
 )
 from reflfield.factorization.sources import (
-    Block,
     Columns,
     Reader,
     as_source,
@@ -31,14 +28,18 @@ from reflfield.factorization.sources import (
     reader_of,
     shuffled_columns,
 )
+from reflfield.factorization.start import (
+    LEAST_COVERAGE,
+    PSEUDO_OBSERVATIONS,
+    start_model,
+    unbiased,
+)
 from reflfield.progress import report
 
-# A column of which less was seen tells the basis nothing that its noise does not.
-LEAST_COVERAGE = 0.02
-# What a row weighs in the first pass, in observations, when it is solved for again.
-PSEUDO_OBSERVATIONS = 2.0
-# Turns on the first block before the others are read.
-START_TURNS = 5
+# A fit is started again if its noise is this many times that of a block fitted on its own,
+STALLED_RATIO = 1.25
+# and the last pass left more than this share of the residual before it.
+SLOW_FALL = 0.9
 
 
 @dataclass(frozen=True)
@@ -206,27 +207,14 @@ def complete(
     if method == "brand":
         fit = fit_brand(reader, rank, passes, block)
         return _finish(reader, fit, block, 0)
-    best: Fit | None = None
-    for attempt in range(restarts + 1):
-        order_rng = np.random.default_rng([seed, attempt])
-        fit = fit_map(reader, rank, passes, block, centred, order_rng)
-        if best is None or fit.residuals[-1] < best.residuals[-1]:
-            best = fit
-        if _settled(fit.residuals):
-            break
-    assert best is not None
-    return _finish(reader, best, block, attempt)
+    fit, attempts = _fit_restarting(reader, rank, passes, block, centred, restarts, seed)
+    return _finish(reader, fit, block, attempts)
 
 
 def _check_options(**counts: int) -> None:
     for name, count in counts.items():
         if count < 1:
             raise InputError(f"{name}: expected at least 1, received {count}")
-
-
-def _settled(residuals: tuple[float, ...]) -> bool:
-    """True if the last pass changed the residual by less than a tenth."""
-    return len(residuals) < 3 or residuals[-1] > 0.9 * residuals[-2]
 
 
 def fit_map(
@@ -236,19 +224,50 @@ def fit_map(
     block: int,
     centred: bool,
     rng: np.random.Generator,
+    rival: float = np.inf,
 ) -> Fit:
-    """Run all passes of block recursive least squares."""
-    model: Model | None = None
-    residuals = []
+    """All passes of block recursive least squares.
+
+    Rows are solved after every block in the first half of the passes, then once a pass.
+    A fit whose first residual is not below `rival` is given up after that pass.
+    """
+    order = shuffled_columns(reader.source, rng)
+    model, floor = start_model(reader, order, rank, block, centred, rng)
+    residuals: list[float] = []
     for number in range(passes):
-        order = shuffled_columns(reader.source, rng)
-        if model is None:
-            model = _start(reader, order, rank, block, centred, rng)
-        model, statistics = one_pass(reader, model, order, block, online=number == 0)
+        online = number < max(1, passes // 2)
+        model, statistics = one_pass(reader, model, order, block, online=online)
         model = resolve_final(with_moments(model, statistics), statistics)
         residuals.append(statistics.residual)
-    assert model is not None
-    return Fit(model, tuple(residuals))
+        if residuals[0] > rival:
+            break
+        order = shuffled_columns(reader.source, rng)
+    variance = unbiased(
+        statistics.squared_residual, statistics.weight, reader.source.shape, rank
+    )
+    return Fit(model, tuple(residuals), _is_stalled(residuals, variance, floor))
+
+
+def _is_stalled(residuals: list[float], variance: float, floor: float) -> bool:
+    """True if the residual is far above that of a single block and no longer falls."""
+    falling = len(residuals) < 2 or residuals[-1] < SLOW_FALL * residuals[-2]
+    return not falling and variance > STALLED_RATIO**2 * floor
+
+
+def _fit_restarting(
+    reader: Reader, rank: int, passes: int, block: int, centred: bool, restarts: int, seed: int
+) -> tuple[Fit, int]:
+    """Best of several column orders; the next is tried only if the fit stalls."""
+    best = fit_map(reader, rank, passes, block, centred, np.random.default_rng([seed, 0]))
+    attempt = 0
+    while best.stalled and attempt < restarts:
+        attempt += 1
+        rng = np.random.default_rng([seed, attempt])
+        rival = 0.9 * best.residuals[0]
+        fit = fit_map(reader, rank, passes, block, centred, rng, rival)
+        if len(fit.residuals) == passes and fit.residuals[-1] < best.residuals[-1]:
+            best = fit
+    return best, attempt
 
 
 def one_pass(
@@ -269,75 +288,6 @@ def one_pass(
             gram = gram_of_samples(model.basis, model.n_channels)
     report("completion", len(order), len(order))
     return model, statistics
-
-
-# --- start ------------------------------------------------------------------------------
-
-
-def _start(
-    reader: Reader,
-    order: Columns,
-    rank: int,
-    block: int,
-    centred: bool,
-    rng: np.random.Generator,
-) -> Model:
-    """Model from the first block that holds observations: its SVD, then a few turns."""
-    for columns in blocks_of(order, block):
-        data = reader.block(columns)
-        counted = data.coverage >= LEAST_COVERAGE
-        if counted.any():
-            break
-    else:
-        raise InputError(
-            f"observed: expected a column of which {LEAST_COVERAGE:.0%} was observed, received "
-            "none; there is nothing to complete from"
-        )
-    model = _svd_model(data, rank, reader.n_channels, centred, rng)
-    for _ in range(START_TURNS):
-        statistics = RowStatistics(model)
-        posterior = infer(model, data, gram_of_samples(model.basis, model.n_channels))
-        statistics.add(data, posterior, counted)
-        model = resolve_online(with_moments(model, statistics), statistics, PSEUDO_OBSERVATIONS)
-    return model
-
-
-def _svd_model(
-    data: Block, rank: int, n_channels: int, centred: bool, rng: np.random.Generator
-) -> Model:
-    """Randomised SVD of a block with zeros (or row means) where nothing was observed."""
-    weights = np.repeat(data.weights, n_channels, axis=0)
-    offset = np.zeros(len(weights), dtype=weights.dtype)
-    if centred:
-        offset = (data.values * weights).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-30)
-    filled = weighted(data.values - offset[:, None], data.weights, n_channels)
-    basis, values = leading_vectors(filled, rank, rng)
-    share = max(float(weights.mean()), LEAST_COVERAGE)
-    variance = (values.astype(np.float64) / share) ** 2 / filled.shape[1]
-    power = float((filled.astype(np.float64) ** 2).sum()) / float(weights.sum())
-    prior = floored(np.diag(variance))
-    model = Model(offset, basis, np.zeros(rank), prior, 0.1 * power, centred, n_channels)
-    return model.quieted()
-
-
-def leading_vectors(
-    matrix: NDArray[np.floating], rank: int, rng: np.random.Generator
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Leading left singular vectors and values by subspace iteration.
-
-    Fewer columns than `rank` are topped up with random vectors of value zero.
-    """
-    sketch = matrix @ rng.standard_normal((matrix.shape[1], rank + 8)).astype(matrix.dtype)
-    scale = np.abs(sketch).max() or 1.0
-    sketch = sketch / scale + 1e-6 * rng.standard_normal(sketch.shape).astype(matrix.dtype)
-    for _ in range(2):
-        q = np.linalg.qr(sketch)[0]
-        sketch = matrix @ (matrix.T @ q) + 1e-6 * scale * q
-    q = np.linalg.qr(sketch)[0]
-    u, values, _ = np.linalg.svd(q.T @ matrix, full_matrices=True)
-    padded = np.zeros(rank, dtype=matrix.dtype)
-    padded[: len(values)] = values[:rank]
-    return q @ u[:, :rank], padded
 
 
 # --- finish -----------------------------------------------------------------------------

@@ -63,7 +63,7 @@ class Model:
     def noise_floor(self) -> float:
         """Variance of rounding, below which the noise means nothing."""
         power = np.trace(self.prior_covariance) + self.prior_mean @ self.prior_mean
-        power = power * float(np.mean(self.basis.astype(np.float64) ** 2)) * self.rank
+        power = power * float((self.basis.astype(np.float64) ** 2).sum()) / len(self.basis)
         return float((8 * np.finfo(self.basis.dtype).eps) ** 2 * power + 1e-300)
 
     def quieted(self) -> Model:
@@ -77,6 +77,7 @@ class Fit:
 
     model: Model
     residuals: tuple[float, ...]
+    stalled: bool = False
 
 
 @dataclass(frozen=True)
