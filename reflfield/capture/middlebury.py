@@ -17,7 +17,7 @@ from reflfield.capture.cameras import Camera
 from reflfield.capture.documents import frame_name, path_inside, read_text, unique_names
 from reflfield.capture.images import image_size
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph
+from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.orientation import estimated_up
 from reflfield.errors import CaptureError
 
@@ -72,6 +72,7 @@ def read_middlebury(description: Path) -> Capture:
                 zip(unique_names(paths, root), paths, strict=True)
             )
         ),
+        base_geometry=usual_base_geometry(len(cameras)),
         up=estimated_up(cameras),
         format="middlebury",
         description=description,

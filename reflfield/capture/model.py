@@ -266,6 +266,17 @@ class Capture:
         return [e.path for p in self.photographs if p.camera == view for e in p.exposures]
 
 
+def usual_base_geometry(n_views: int) -> str:
+    """Base geometry where a description does not say: one view knows no shape.
+
+    Examples
+    --------
+    >>> usual_base_geometry(1), usual_base_geometry(16)
+    ('plane', 'hull')
+    """
+    return PLANE if n_views == 1 else HULL
+
+
 def check_photographs(capture: Capture) -> None:
     """Demand that every photograph exists and has its camera's size (headers only).
 

@@ -16,7 +16,7 @@ from jsonschema.exceptions import best_match
 from reflfield.capture.cameras import Camera
 from reflfield.capture.documents import path_inside, read_json, unique_names
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph
+from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.errors import CaptureError
 
 FILE_NAME = "capture.json"
@@ -55,7 +55,7 @@ def read_native(description: Path) -> Capture:
         cameras=cameras,
         lights=lights,
         photographs=_photographs(document, cameras, lights, description),
-        base_geometry=document.get("base_geometry", "hull"),
+        base_geometry=document.get("base_geometry", usual_base_geometry(len(cameras))),
         silhouettes=tuple(
             path_inside(root, entry["silhouette"], description)
             if "silhouette" in entry

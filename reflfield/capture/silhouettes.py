@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.images import encode_srgb
+from reflfield.checks import check_shape
 from reflfield.errors import CaptureError, InputError
 
 Float32 = NDArray[np.float32]
@@ -34,8 +35,9 @@ class SilhouetteOptions:
     border : float
         Width of the frame whose pixels stand for the backdrop.
     uniform_spread : float
-        The backdrop counts as uniform if nine tenths of the border differ from its median
-        colour by less than this (sRGB-encoded, in [0, 1]).
+        The backdrop counts as uniform if three quarters of the border differ from its
+        median colour by less than this (sRGB-encoded, in [0, 1]); the object may cross the
+        rest.
     least_contrast : float
         Difference from the backdrop (encoded) below which nothing is object.
     margin : float
@@ -95,7 +97,7 @@ def silhouette_from_photographs(
     CaptureError
         If no object is found.
     InputError
-        If there are no photographs or their sizes differ.
+        If there are no photographs, they are not (h, w, 3), or their sizes differ.
 
     Examples
     --------
@@ -113,7 +115,7 @@ def silhouette_from_photographs(
     border = _border(image.shape[0], image.shape[1], options.border)
     backdrop = np.median(encoded[border], axis=0)
     difference = np.abs(encoded - backdrop).max(axis=2)
-    uniform = np.quantile(difference[border], 0.9) < options.uniform_spread
+    uniform = np.quantile(difference[border], 0.75) < options.uniform_spread
     if uniform:
         inside = _differs_from_backdrop(difference, options)
     else:
@@ -135,6 +137,7 @@ def _mean(photographs: Iterable[Float32], name: str) -> Float32:
     """Mean of the photographs, one in memory at a time."""
     total, count = None, 0
     for photograph in photographs:
+        check_shape(f"{name}: photograph", photograph, (None, None, 3))
         if total is not None and total.shape != photograph.shape:
             raise InputError(
                 f"{name}: expected photographs of one size, received {total.shape} and "
@@ -283,5 +286,13 @@ def _soft_edged(
     trusted = (weight >= 1) & (object_difference > 0.02) & ~filled
     ratio = np.clip(difference / np.maximum(object_difference, 1e-6), 0, 1)
     band = (cv2.dilate(solid, disc) > 0) & ~core
-    plain = _smoothed(inside)
-    return np.where(band & trusted, ratio, plain).astype(np.float32)
+    soft = np.where(band & trusted, ratio, _smoothed(inside)).astype(np.float32)
+    return _without_specks(soft, options)
+
+
+def _without_specks(coverage: Float32, options: SilhouetteOptions) -> Float32:
+    """Coverage without the single pixels that a ratio of dark values leaves behind."""
+    solid = coverage > 0.5
+    parts = _large_parts(solid, options.smallest_part)
+    clean = ~_large_holes(~parts, options.smallest_hole * float(parts.sum()))
+    return np.where(clean == solid, coverage, clean).astype(np.float32)

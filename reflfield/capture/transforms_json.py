@@ -25,7 +25,7 @@ from reflfield.capture.documents import (
 )
 from reflfield.capture.images import image_size
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph
+from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.orientation import estimated_up
 from reflfield.errors import CaptureError
 
@@ -104,6 +104,7 @@ def read_transforms(description: Path) -> Capture:
                 unique_names(paths, root), paths, pairs, strict=True
             )
         ),
+        base_geometry=usual_base_geometry(len(cameras.items)),
         silhouettes=tuple(silhouettes.get(view) for view in range(len(cameras.items))),
         up=_up(document, cameras.items, description),
         format="transforms",

@@ -1,0 +1,618 @@
+"""Readers: each format, told apart by content, and everything that can be wrong with it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reflfield.capture import documents
+from reflfield.capture.images import encode_srgb, write_exr, write_png
+from reflfield.capture.native import schema
+from reflfield.capture.readers import open_capture
+from reflfield.errors import CaptureError
+
+FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
+
+
+@pytest.fixture
+def native(tmp_path):
+    """A writable copy of the frozen capture: its folder, and its description to edit."""
+    folder = tmp_path / "frozen"
+    shutil.copytree(FROZEN, folder)
+    return folder
+
+
+def edited(folder, change):
+    """The folder after `change(document)` was applied to its description."""
+    path = folder / "capture.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+    return folder
+
+
+class TestNativeContract:
+    """The frozen version 1 capture reads today as on the day it was written."""
+
+    def test_counts_and_kinds(self):
+        capture = open_capture(FROZEN)
+        assert (capture.name, capture.format, capture.base_geometry) == (
+            "frozen",
+            "native",
+            "hull",
+        )
+        assert [c.id for c in capture.cameras] == ["v000", "v001"]
+        assert [light.kind for light in capture.lights] == ["point", "directional", "spot"]
+        assert capture.photograph_index.tolist() == [[0, 1, 2], [3, 4, 5]]
+        assert [p.name for p in capture.photographs][:2] == ["v000_l000", "v000_l001"]
+        assert capture.up.tolist() == [0, 0, 1]
+
+    def test_pixels(self):
+        # R = x / 8, G = y / 8, B = (view + 2 light) / 4
+        capture = open_capture(FROZEN)
+        y, x = np.mgrid[:6, :8]
+        for index, photograph in enumerate(capture.photographs):
+            blue = (photograph.camera + 2 * photograph.light) / 4
+            expected = np.stack([x / 8, y / 8, np.full((6, 8), blue)], axis=-1)
+            np.testing.assert_array_equal(capture.read_photograph(index), expected)
+
+    def test_silhouette(self):
+        coverage = open_capture(FROZEN).read_silhouette(0)
+        assert coverage[1, 2] == pytest.approx(128 / 255)
+        assert coverage[2, 2] == 1
+        assert coverage[0, 0] == 0
+
+    def test_cameras(self):
+        first, second = open_capture(FROZEN).cameras
+        # two metres before the origin, looking along +y: x right, z up
+        pixels, depth = first.project([[0, 0, 0], [0.5, 0, 0.25]])
+        np.testing.assert_allclose(pixels, [[4, 3], [8, 1]], atol=1e-12)
+        np.testing.assert_allclose(depth, [2, 2], atol=1e-12)
+        np.testing.assert_allclose(second.centre, [0, -2, 2], atol=1e-11)
+        assert second.distortion == (-0.1, 0, 0.001, 0, 0, 0)
+
+    def test_lights(self):
+        point, far, spot = open_capture(FROZEN).lights
+        np.testing.assert_allclose(point.irradiance([[0, 0, 0]]), [[1, 1, 2]])
+        np.testing.assert_allclose(far.directions([[0, 0, 0]]), [[0, -(0.5**0.5), 0.5**0.5]])
+        np.testing.assert_allclose(far.irradiance([[0, 0, 0]]), [[1, 2, 3]])
+        np.testing.assert_allclose(spot.irradiance([[0, 0, 0], [0, -2, 0]]), [[4] * 3, [0] * 3])
+
+    def test_description_file_and_forced_format_mean_the_same(self):
+        for capture in (
+            open_capture(FROZEN / "capture.json"),
+            open_capture(FROZEN, "native"),
+            open_capture(str(FROZEN)),
+        ):
+            assert len(capture.photographs) == 6
+
+
+class TestNative:
+    def test_photographs_as_a_list(self, native):
+        def change(document):
+            document["photographs"] = [
+                {"camera": "v001", "light": "l002", "file": "photographs/v001_l002.exr"},
+                {"camera": "v000", "light": "l000", "file": "photographs/v000_l000.exr"},
+            ]
+
+        capture = open_capture(edited(native, change))
+        assert capture.photograph_index.tolist() == [[1, -1, -1], [-1, -1, 0]]
+
+    def test_bracketed_exposures_are_merged(self, native):
+        radiance = np.linspace(0.05, 3, 6 * 8 * 3).reshape(6, 8, 3)
+        seconds = [0.1, 0.4, 1.6]
+        for i, t in enumerate(seconds):
+            encoded = np.round(encode_srgb(np.clip(radiance * t, 0, 1)) * 65535)
+            write_png(native / f"shot{i}.png", encoded.astype(np.uint16))
+        entry = {
+            "camera": "v000",
+            "light": "l000",
+            "exposures": [
+                {"file": f"shot{i}.png", "seconds": t} for i, t in enumerate(seconds)
+            ],
+        }
+        capture = open_capture(edited(native, lambda d: d.update(photographs=[entry])))
+        # 16-bit steps in the darkest values used
+        np.testing.assert_allclose(capture.read_photograph(0), radiance, rtol=2e-3)
+
+    def test_optional_fields(self, native):
+        def change(document):
+            document.update(
+                up=[0, 1, 0],
+                base_geometry="plane",
+                photographs=[
+                    {"camera": "v000", "light": "sky", "file": "photographs/v000_l000.exr"}
+                ],
+            )
+            document["cameras"][0]["model"] = "orthographic"
+            del document["cameras"][0]["silhouette"]
+            document["lights"] = [{"id": "sky", "type": "environment", "file": "sky.exr"}]
+
+        capture = open_capture(edited(native, change))
+        assert capture.up.tolist() == [0, 1, 0]
+        assert capture.cameras[0].kind == "orthographic"
+        assert capture.lights[0].file == native / "sky.exr"
+        np.testing.assert_array_equal(capture.read_silhouette(0), np.ones((6, 8)))
+
+    @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            (lambda d: d.update(version=2), "newer version 2; update"),
+            (lambda d: d.update(version=0), "version: 1 was expected"),
+            (lambda d: d.pop("cameras"), "'cameras' is a required"),
+            (lambda d: d.update(cameras=[]), "cameras"),
+            (lambda d: d["cameras"][0].update(fl_x="wide"), r"cameras\[0\]\.fl_x"),
+            (lambda d: d["cameras"][0].update(focal=1), r"cameras\[0\].*'focal'"),
+            (lambda d: d["cameras"][1].update(id="v000"), "duplicate camera id 'v000'"),
+            (lambda d: d["cameras"][1].update(id="../x"), r"cameras\[1\]\.id"),
+            (lambda d: d["lights"][1].update(id="l000"), "duplicate light id 'l000'"),
+            (lambda d: d["lights"][0].pop("position"), r"lights\[0\].*position"),
+            (lambda d: d["lights"][0].update(intensity=[1, 1, -1]), r"lights\[0\]\.intensity"),
+            (
+                lambda d: d["cameras"][0].update(camera_from_world=np.zeros((4, 4)).tolist()),
+                "camera 'v000'.*last row",
+            ),
+            (
+                lambda d: d["cameras"][0].update(
+                    camera_from_world=np.diag([1.0, 1, 0, 1]).tolist()
+                ),
+                "camera 'v000'.*singular",
+            ),
+            (lambda d: d["cameras"][0].update(fl_x=0), "camera 'v000'.*singular.*fl_x"),
+            (lambda d: d["photographs"].update(pattern="x_{camera}.exr"), "pattern"),
+            (
+                lambda d: d["photographs"].update(pattern="../{camera}_{light}.exr"),
+                "leaves the folder",
+            ),
+            (
+                lambda d: d["photographs"].update(pattern="/tmp/{camera}_{light}.exr"),
+                "leaves the folder",
+            ),
+            (lambda d: d["cameras"][0].update(silhouette="../s.png"), "leaves the folder"),
+            (
+                lambda d: d.update(
+                    photographs=[{"camera": "v9", "light": "l000", "file": "a"}]
+                ),
+                "id of a camera.*'v9'",
+            ),
+            (
+                lambda d: d.update(
+                    photographs=[{"camera": "v000", "light": "l9", "file": "a"}]
+                ),
+                "id of a light.*'l9'",
+            ),
+            (
+                lambda d: d.update(photographs=[{"camera": "v000", "light": "l000"}]),
+                "photographs",
+            ),
+            (
+                lambda d: d.update(
+                    photographs=[
+                        {
+                            "camera": "v000",
+                            "light": "l000",
+                            "file": "photographs/v000_l000.exr",
+                        },
+                        {
+                            "camera": "v000",
+                            "light": "l000",
+                            "file": "photographs/v000_l001.exr",
+                        },
+                    ]
+                ),
+                "duplicate photograph of camera 'v000' under light 'l000'",
+            ),
+        ],
+    )
+    def test_bad_descriptions(self, native, change, reason):
+        with pytest.raises(CaptureError, match=reason):
+            open_capture(edited(native, change))
+
+    @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+    def test_numbers_that_are_not_finite(self, native, number):
+        path = native / "capture.json"
+        path.write_text(path.read_text().replace('"fl_x": 16.0', f'"fl_x": {number}', 1))
+        with pytest.raises(CaptureError, match=r"capture\.json.*not finite"):
+            open_capture(native)
+
+    def test_missing_photographs_are_counted_at_opening(self, native):
+        (native / "photographs/v000_l002.exr").unlink()
+        (native / "photographs/v001_l001.exr").unlink()
+        with pytest.raises(CaptureError, match=r"v000_l002\.exr.*missing \(2 of 6"):
+            open_capture(native)
+        assert len(open_capture(native, require_photographs=False).photographs) == 6
+
+    def test_image_of_another_size(self, native):
+        write_exr(native / "photographs/v001_l000.exr", np.zeros((6, 9, 3), np.float32))
+        with pytest.raises(CaptureError, match=r"v001_l000.*image size.*8 x 6.*'v001'.*9 x 6"):
+            open_capture(native)
+
+    def test_truncated_photograph(self, native):
+        path = native / "photographs/v001_l000.exr"
+        path.write_bytes(path.read_bytes()[:-20])
+        with pytest.raises(CaptureError, match=r"v001_l000\.exr.*truncated"):
+            open_capture(native).read_photograph(3)
+
+    def test_empty_silhouette(self, native):
+        write_png(native / "silhouettes/v001.png", np.zeros((6, 8), np.uint8))
+        with pytest.raises(CaptureError, match=r"v001\.png.*empty silhouette.*'v001'"):
+            open_capture(native).read_silhouette(1)
+
+    def test_silhouette_of_another_size(self, native):
+        write_png(native / "silhouettes/v001.png", np.full((5, 8), 255, np.uint8))
+        with pytest.raises(CaptureError, match=r"v001\.png.*image size"):
+            open_capture(native).read_silhouette(1)
+
+    def test_link_that_leaves_the_folder(self, native, tmp_path):
+        outside = tmp_path / "outside.exr"
+        (native / "photographs/v000_l000.exr").rename(outside)
+        (native / "photographs/v000_l000.exr").symlink_to(outside)
+        with pytest.raises(CaptureError, match="leaves the folder"):
+            open_capture(native)
+
+    def test_schema_is_what_it_says(self):
+        assert schema()["properties"]["version"] == {"const": 1}
+
+
+def frame(name="a", position=(0.0, 0.0, 1.0), **more):
+    """A frame two metres up the +z axis in OpenGL axes, looking down at the origin."""
+    matrix = np.eye(4)
+    matrix[2, 3] = 2
+    return {
+        "file_path": name,
+        "transform_matrix": matrix.tolist(),
+        "pl_pos": list(position),
+        "pl_intensity": [4.0, 4.0, 4.0],
+    } | more
+
+
+def write_frames(folder, frames, **common):
+    document = {"fl_x": 10.0, "fl_y": 10.0, "w": 8, "h": 6, "frames": frames} | common
+    folder.mkdir(exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+class TestTransforms:
+    def open(self, folder, frames, **common):
+        return open_capture(write_frames(folder, frames, **common), require_photographs=False)
+
+    def test_axes(self, tmp_path):
+        # OpenGL camera at z = 2 looking along -z, y up: world +y is up in the image.
+        camera = self.open(tmp_path / "c", [frame()]).cameras[0]
+        np.testing.assert_allclose(camera.centre, [0, 0, 2], atol=1e-15)
+        np.testing.assert_allclose(camera.up, [0, 1, 0], atol=1e-15)
+        pixels, depth = camera.project([[0.2, 0.4, 0.0]])
+        np.testing.assert_allclose(pixels, [[4 + 1, 3 - 2]], atol=1e-14)
+        assert depth.tolist() == [2]
+
+    def test_same_cameras_and_lights_become_one(self, tmp_path):
+        other = frame("x", position=(1, 0, 0))
+        moved = frame("y")
+        moved["transform_matrix"][0][3] = 1.0
+        capture = self.open(tmp_path / "c", [frame("a"), other, moved])
+        assert [c.id for c in capture.cameras] == ["v000", "v001"]
+        assert [light.id for light in capture.lights] == ["l000", "l001"]
+        assert capture.photograph_index.tolist() == [[0, 1], [2, -1]]
+        assert [p.name for p in capture.photographs] == ["a", "x", "y"]
+
+    def test_angle_instead_of_focal_length(self, tmp_path):
+        # 90 degrees over 8 pixels: focal length 4
+        folder = write_frames(tmp_path / "c", [frame()])
+        document = json.loads((folder / "transforms.json").read_text())
+        del document["fl_x"], document["fl_y"]
+        document["camera_angle_x"] = np.pi / 2
+        (folder / "transforms.json").write_text(json.dumps(document))
+        capture = open_capture(folder, require_photographs=False)
+        assert capture.cameras[0].fl_x == pytest.approx(4)
+        assert capture.cameras[0].fl_y == pytest.approx(4)
+
+    def test_frame_overrides_the_top(self, tmp_path):
+        capture = self.open(tmp_path / "c", [frame("a", fl_x=20.0), frame("b", cx=1.0)])
+        assert [c.fl_x for c in capture.cameras] == [20, 10]
+        assert [c.cx for c in capture.cameras] == [4, 1]
+
+    def test_suffix_is_found(self, tmp_path):
+        folder = write_frames(tmp_path / "c", [frame("./img/r_0.5")])
+        (folder / "img").mkdir()
+        write_png(folder / "img/r_0.5.png", np.full((6, 8, 3), 255, np.uint8))
+        capture = open_capture(folder)
+        assert capture.photographs[0].name == "r_0.5"
+        assert capture.read_photograph(0).shape == (6, 8, 3)
+
+    def test_size_from_the_photograph(self, tmp_path):
+        folder = write_frames(tmp_path / "c", [frame("a.exr")])
+        document = json.loads((folder / "transforms.json").read_text())
+        del document["w"], document["h"]
+        (folder / "transforms.json").write_text(json.dumps(document))
+        with pytest.raises(CaptureError, match="'w' and 'h'"):
+            open_capture(folder)
+        write_exr(folder / "a.exr", np.zeros((3, 5, 3), np.float32))
+        assert open_capture(folder).cameras[0].width == 5
+
+    def test_frame_without_light_is_under_an_unknown_one(self, tmp_path):
+        unlit = {k: v for k, v in frame("b").items() if not k.startswith("pl_")}
+        capture = self.open(tmp_path / "c", [frame("a"), unlit])
+        assert [light.kind for light in capture.lights] == ["point", "unknown"]
+        assert not capture.lights_known
+
+    def test_environment_per_frame(self, tmp_path):
+        frames = [
+            frame("a", environment="maps/sky.exr"),
+            frame("b", environment="maps/sky.exr"),
+            frame("c", environment="maps/sky.exr", environment_convention="blender"),
+        ]
+        capture = self.open(tmp_path / "c", frames)
+        assert [light.kind for light in capture.lights] == ["environment"] * 2
+        assert [light.convention for light in capture.lights] == ["mitsuba", "blender"]
+        assert capture.lights[0].file == tmp_path / "c/maps/sky.exr"
+
+    def test_several_lights_at_once(self, tmp_path):
+        capture = self.open(tmp_path / "c", [frame("a", position=[[0, 0, 1], [0, 0, 2]])])
+        first, second = capture.lights[0].sources
+        assert first.position.tolist() == [0, 0, 1]
+        assert second.intensity.tolist() == [4, 4, 4]
+
+    def test_one_camera_stands_before_a_plane(self, tmp_path):
+        assert self.open(tmp_path / "a", [frame()]).base_geometry == "plane"
+        assert self.open(tmp_path / "b", [frame(), frame("b", cx=1.0)]).base_geometry == "hull"
+
+    def test_repeated_names_get_their_folder(self, tmp_path):
+        other = frame("test/0.exr", position=(1, 0, 0))
+        capture = self.open(tmp_path / "c", [frame("train/0.exr"), other])
+        assert [p.name for p in capture.photographs] == ["train_0", "test_0"]
+
+    def test_up(self, tmp_path):
+        assert self.open(tmp_path / "a", [frame()]).up.tolist() == [0, 1, 0]
+        assert self.open(tmp_path / "b", [frame()], up=[0, 0, 2]).up.tolist() == [0, 0, 1]
+
+    @pytest.mark.parametrize(
+        ("bad", "reason"),
+        [
+            (frame(transform_matrix=np.zeros((4, 4)).tolist()), "singular matrix"),
+            (frame(transform_matrix=(2 * np.eye(4)).tolist()), "camera_from_world"),
+            (frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "scale or shear"),
+            (frame(transform_matrix=[[1, 2], [3]]), "transform_matrix"),
+            (frame(transform_matrix="x"), "transform_matrix"),
+            (frame(position=(0, 0)), "pl_pos"),
+            (frame(pl_intensity="bright"), "pl_intensity"),
+            (frame(pl_intensity=[[1, 1, 1], [2, 2, 2]]), "pl_intensity"),
+            (frame(pl_intensity=[-1, 1, 1]), "intensity"),
+            (frame(camera_model="OPENCV_FISHEYE"), "camera_model.*FISHEYE"),
+            (frame(k4=0.1), "k4"),
+            (frame(fl_x=True), "fl_x"),
+            (frame(fl_x=-1), "focal length"),
+            (frame(mask_path="../m.png"), "leaves the folder"),
+            (frame("/etc/passwd"), "leaves the folder"),
+            (frame(environment="../sky.exr"), "leaves the folder"),
+            (frame(environment="sky.exr", environment_convention="up"), "convention"),
+            ({"transform_matrix": np.eye(4).tolist()}, r"frames\[0\].*file_path"),
+            (7, r"frames\[0\]"),
+        ],
+    )
+    def test_bad_frames(self, tmp_path, bad, reason):
+        with pytest.raises(CaptureError, match=reason):
+            self.open(tmp_path / "c", [bad])
+
+    def test_no_frames(self, tmp_path):
+        with pytest.raises(CaptureError, match="frames"):
+            self.open(tmp_path / "c", [])
+
+    def test_mitsuba_spot(self, shared_data):
+        capture = open_capture(shared_data("mitsuba_spot"))
+        assert (capture.n_views, capture.n_lights, len(capture.photographs)) == (32, 32, 1024)
+        assert (capture.photograph_index >= 0).all()
+        assert capture.up.tolist() == [0, 1, 0]
+        # cameras at .65 m look at the origin: it lies at the principal point
+        for camera in capture.cameras:
+            pixels, depth = camera.project([[0.0, 0.0, 0.0]])
+            np.testing.assert_allclose(pixels, [[64, 64]], atol=1e-3)  # float32 poses
+            assert depth[0] == pytest.approx(0.65, abs=1e-6)
+
+    def test_mitsuba_positions_project_to_their_pixels(self, shared_data):
+        folder = shared_data("mitsuba_spot")
+        capture = open_capture(folder)
+        for view in (0, 8, 16, 24):
+            buffers = np.load(folder / "truth" / f"aov_{view:03d}.npy").astype(np.float64)
+            solid = capture.read_silhouette(view) > 0.99  # its full pixels say 254
+            pixels, _ = capture.cameras[view].project(buffers[..., 6:9][solid])
+            row, column = np.nonzero(solid)
+            error = np.abs(pixels - np.stack([column + 0.5, row + 0.5], axis=1)).max(axis=1)
+            # positions are pixel averages in half precision: a tenth of a pixel, except
+            # where a pixel straddles a step in depth
+            assert np.median(error) < 0.15
+            assert np.abs(np.median(pixels[:, 0] - column)) == pytest.approx(0.5, abs=0.02)
+
+    def test_mitsuba_frames_to_relight(self, shared_data):
+        capture = open_capture(shared_data("mitsuba_spot") / "truth" / "relit.json")
+        assert {light.kind for light in capture.lights} == {"environment"}
+        assert all(light.file.is_file() for light in capture.lights)
+        assert capture.photographs[0].name == "relit_courtyard_0"
+
+
+class TestMiddlebury:
+    LINE = "a.png 100 0 3.5 0 100 2.5 0 0 1 1 0 0 0 1 0 0 0 1 0 0 2"
+
+    def write(self, folder, *lines, count=None):
+        folder.mkdir(exist_ok=True)
+        write_png(folder / "a.png", np.full((6, 8, 3), 128, np.uint8))
+        text = "\n".join([str(len(lines) if count is None else count), *lines, ""])
+        (folder / "a_par.txt").write_text(text)
+        return folder
+
+    def test_by_hand(self, tmp_path):
+        capture = open_capture(self.write(tmp_path / "c", self.LINE))
+        pixels, depth = capture.cameras[0].project([[0.02, 0.0, 0.0]])
+        # whole-number pixel centres: (4.5, 2.5) there is (5, 3) here
+        np.testing.assert_allclose(pixels, [[5.0, 3.0]], atol=1e-13)
+        assert depth.tolist() == [2]
+        assert [light.kind for light in capture.lights] == ["unknown"]
+        assert capture.cameras[0].id == "a"
+
+    @pytest.mark.parametrize(
+        ("lines", "count", "reason"),
+        [
+            ([LINE], 2, "number of images"),
+            ([LINE, "b.png 1 2 3"], None, "21 finite numbers"),
+            ([LINE.replace("3.5", "nan")], None, "21 finite numbers"),
+            ([LINE.replace("100 0 3.5", "0 0 0")], None, "'a.png'.*singular"),
+            ([LINE.replace("100 0 3.5", "100 9 3.5")], None, "skew"),
+            (
+                [LINE.replace("1 0 0 0 1 0 0 0 1 0", "1 0 0 0 1 0 0 0 0 0")],
+                None,
+                "singular|row",
+            ),
+            ([LINE.replace("a.png", "../a.png")], None, "leaves the folder"),
+            ([LINE.replace("a.png", "gone.png")], None, r"gone\.png"),
+        ],
+    )
+    def test_bad_lines(self, tmp_path, lines, count, reason):
+        with pytest.raises(CaptureError, match=reason):
+            open_capture(self.write(tmp_path / "c", *lines, count=count), "middlebury")
+
+    def test_dino(self, shared_data):
+        capture = open_capture(shared_data("middlebury_sparse_rings") / "dinoSparseRing")
+        assert (capture.format, capture.n_views, capture.n_lights) == ("middlebury", 16, 1)
+        # the README's bounding box projects into the images; the ring's axis is +y
+        low, high = np.array(
+            [(-0.061897, -0.018874, -0.057845), (0.010897, 0.068227, 0.015495)]
+        )
+        middle = (low + high) / 2
+        for camera in capture.cameras:
+            pixels, depth = camera.project(middle[None])
+            assert camera.contains(pixels).all()
+            assert 0.5 < depth[0] < 0.8
+        assert capture.up.tolist() == [0, 1, 0]
+
+
+class TestLp:
+    def write(self, folder, *lines, count=None):
+        folder.mkdir(exist_ok=True)
+        text = "\n".join([str(len(lines) if count is None else count), *lines, ""])
+        (folder / "dome.lp").write_text(text)
+        for name in ("a.png", "b c.png"):
+            write_png(folder / name, np.full((4, 8, 3), 128, np.uint8))
+        return folder
+
+    def test_by_hand(self, tmp_path):
+        folder = self.write(tmp_path / "c", "a.png 0 0 2", "b c.png 3 0 4")
+        capture = open_capture(folder)
+        assert (capture.format, capture.base_geometry) == ("lp", "plane")
+        assert [p.name for p in capture.photographs] == ["a", "b c"]
+        directions = [light.directions([[0, 0, 0]])[0].tolist() for light in capture.lights]
+        assert directions == [[0, 0, 1], [0.6, 0, 0.8]]
+        assert capture.lights[1].irradiance([[0, 0, 0]]).tolist() == [[1, 1, 1]]
+        # 8 pixels are 1 m; x right, y up, z towards the camera
+        camera = capture.cameras[0]
+        pixels, depth = camera.project([[0, 0, 0], [0.5, 0.25, 0.1]])
+        np.testing.assert_allclose(pixels, [[4, 2], [8, 0]], atol=1e-14)
+        assert depth[1] < depth[0]
+        np.testing.assert_allclose(camera.view_directions([[0, 0, 0]]), [[0, 0, 1]])
+        np.testing.assert_array_equal(capture.read_silhouette(0), np.ones((4, 8)))
+
+    def test_file_beside_when_its_folder_got_lost(self, tmp_path):
+        capture = open_capture(self.write(tmp_path / "c", "jpeg-exports/a.png 0 0 1"))
+        assert capture.photographs[0].path.name == "a.png"
+        assert capture.read_photograph(0).shape == (4, 8, 3)
+
+    @pytest.mark.parametrize(
+        ("lines", "count", "reason"),
+        [
+            (["a.png 0 0 1"], 2, "number of photographs"),
+            (["a.png 0 0 1"], "x", "number of photographs"),
+            (["a.png 0,1 0,2 0,9"], None, "decimal commas"),
+            (["a.png 0 0 0"], None, "light direction of 'a.png'"),
+            (["a.png 0 0 nan"], None, "light direction of 'a.png'"),
+            (["a.png 0 0"], None, "three numbers"),
+            (["../a.png 0 0 1"], None, "leaves the folder"),
+            (["gone.png 0 0 1"], None, r"gone\.png"),
+            (["a.png 0 0 1", "gone.png 0 0 1"], None, r"gone\.png.*missing \(1 of 2"),
+        ],
+    )
+    def test_bad_lines(self, tmp_path, lines, count, reason):
+        with pytest.raises(CaptureError, match=reason):
+            open_capture(self.write(tmp_path / "c", *lines, count=count), "lp")
+
+    def test_more_than_a_thousand_lights(self, tmp_path):
+        folder = self.write(tmp_path / "c", *[f"a.png {i} 1 1" for i in range(1200)])
+        capture = open_capture(folder, require_photographs=False)
+        assert capture.n_lights == 1200
+        assert capture.photographs[1].name == "a_1"
+
+    def test_loewenkopf(self, shared_data):
+        capture = open_capture(shared_data("rti_loewenkopf"))
+        assert (capture.n_views, capture.n_lights) == (1, 240)
+        assert (np.stack([light.direction for light in capture.lights])[:, 2] > 0).all()
+        # light from the left and light from the right show different sides
+        azimuth = np.array([light.direction[0] for light in capture.lights])
+        left, right = (capture.read_photograph(int(f(azimuth))) for f in (np.argmin, np.argmax))
+        assert np.corrcoef(left.ravel(), right.ravel())[0, 1] < 0.8
+
+
+class TestDetection:
+    def test_description_by_content_not_by_name(self, tmp_path, native):
+        path = native / "other.json"
+        (native / "capture.json").rename(path)
+        assert open_capture(path).format == "native"
+
+    def test_two_descriptions_ask_for_one(self, native):
+        write_frames(native, [frame("photographs/v000_l000.exr")])
+        with pytest.raises(
+            CaptureError, match=r"expected one of.*capture\.json, transforms\.json"
+        ):
+            open_capture(native)
+        assert open_capture(native, "native").format == "native"
+        assert open_capture(native, "transforms").format == "transforms"
+
+    def test_folder_without_description(self, tmp_path):
+        with pytest.raises(CaptureError, match=r"none of them"):
+            open_capture(tmp_path)
+
+    def test_nothing_there(self, tmp_path):
+        with pytest.raises(CaptureError, match="does not exist"):
+            open_capture(tmp_path / "gone")
+
+    def test_unknown_format(self, tmp_path):
+        with pytest.raises(CaptureError, match=r"format.*'colmap'"):
+            open_capture(tmp_path, "colmap")
+
+    @pytest.mark.parametrize(
+        ("content", "reason"),
+        [
+            (b"PK\x03\x04\xff\xfe", "zip archive; unpack"),
+            (b"\x89RFLD\xff\xfe\x00", "binary"),
+            (b"hello", "capture description"),
+            (b"", "capture description"),
+            (b"{}", "capture description"),
+            (b'{"frames": [', "expected JSON"),
+            (b"[" * 100000, "capture description"),
+            (b'{"a":' * 100000, "expected JSON"),
+        ],
+    )
+    def test_other_files(self, tmp_path, content, reason):
+        path = tmp_path / "thing.json"
+        path.write_bytes(content)
+        with pytest.raises(CaptureError, match=rf"thing\.json.*{reason}"):
+            open_capture(path)
+
+    def test_array_named_as_capture(self, tmp_path):
+        (tmp_path / "capture.json").write_text("[1, 2]")
+        with pytest.raises(CaptureError, match="JSON object, received list"):
+            open_capture(tmp_path)
+
+    def test_oversized_description(self, native, monkeypatch):
+        monkeypatch.setattr(documents, "MAX_DOCUMENT_BYTES", 100)
+        with pytest.raises(CaptureError, match=r"capture\.json.*at most"):
+            open_capture(native)
+
+    def test_byte_order_mark(self, native):
+        path = native / "capture.json"
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+        assert open_capture(native).n_views == 2
+
+    def test_path_with_a_nul(self, native):
+        change = {"pattern": "a\0{camera}{light}"}
+        with pytest.raises(CaptureError, match="not a usable path"):
+            open_capture(edited(native, lambda d: d.update(photographs=change)))
