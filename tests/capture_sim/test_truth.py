@@ -119,6 +119,15 @@ def test_points_are_spread_evenly_over_the_area():
     assert height.var() == pytest.approx(1 / 3, abs=4 * np.sqrt(4 / 45 / 4000))
 
 
+def test_points_are_spread_evenly_within_a_triangle():
+    plate = scene({"type": "plane", "size": [0.2, 0.2]}, truth={"points": 4000})
+    assert len(plate.mesh.faces) == 2
+    place = area_uniform_points(plate, np.random.default_rng(5)).position[:, :2] / 0.1
+    # Uniform in [-1, 1]^2: mean 0, variance 1/3; 4 sigma.
+    np.testing.assert_allclose(place.mean(axis=0), 0.0, atol=4 * np.sqrt(1 / 3 / 4000))
+    np.testing.assert_allclose(place.var(axis=0), 1 / 3, atol=4 * np.sqrt(4 / 45 / 4000))
+
+
 def test_lights_visible_by_blocks(monkeypatch):
     import capture_sim.truth
 
