@@ -15,12 +15,14 @@ from capture_sim.objects.mesh import Array, Faces, SurfaceMesh, unit, without_sl
 from capture_sim.tables import TableReader
 
 MOST_FACES = 20_000_000
+# Relative to the size of the object: files store single precision or few digits.
+SAME_PLACE = 1e-7
 
 
 def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     """Mesh file, turned, centred, scaled and moved."""
     path = reader.file("file", folder)
-    vertices, faces, uv, normals = read_mesh(path)
+    vertices, faces, uv = read_mesh(path)
     rotation = Rotation.from_euler(
         "xyz", reader.vector("rotation_deg", (0, 0, 0)), degrees=True
     )
@@ -31,12 +33,11 @@ def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     scale = reader.number("scale", 1.0, low=1e-9, high=1e9)
     size = reader.number("size", extent * scale, low=1e-9, high=1e9)
     vertices = vertices * (size / extent) + reader.vector("position", (0, 0, 0))
-    turned = None if normals is None else rotation.apply(normals)
-    return finish_mesh(vertices, faces, uv, turned, path.name)
+    return finish_mesh(vertices, faces, uv, path.name, smooth=reader.flag("smooth", True))
 
 
-def read_mesh(path: Path) -> tuple[Array, Faces, Array | None, Array | None]:
-    """Vertices, faces, texture coordinates and normals of a mesh file.
+def read_mesh(path: Path) -> tuple[Array, Faces, Array | None]:
+    """Vertices, faces and texture coordinates of a mesh file.
 
     Parameters
     ----------
@@ -48,8 +49,7 @@ def read_mesh(path: Path) -> tuple[Array, Faces, Array | None, Array | None]:
     vertices : (n, 3) float64
     faces : (m, 3) int32
     uv : (n, 2) float64 or None
-    normals : (n, 3) float64 or None
-        None where the file holds none.
+        None if the file holds none.
 
     Raises
     ------
@@ -69,28 +69,21 @@ def read_mesh(path: Path) -> tuple[Array, Faces, Array | None, Array | None]:
     inside = (faces >= 0).all() and (faces < len(vertices)).all()
     if not inside or not np.isfinite(vertices).all() or not np.ptp(vertices):
         raise scene_error(str(path), "finite vertices and faces among them", "others")
+    return vertices, faces.astype(np.int32), _coordinates(mesh, len(vertices))
+
+
+def _coordinates(mesh: Any, n_vertices: int) -> Array | None:
+    """Texture coordinates of a mesh if it has a usable one for each vertex."""
     uv = getattr(mesh.visual, "uv", None)
-    normals = mesh.vertex_normals if "vertex_normals" in mesh._cache.cache else None
-    return (
-        vertices,
-        faces.astype(np.int32),
-        _rows_or_none(uv, len(vertices), 2),
-        _rows_or_none(normals, len(vertices), 3),
-    )
-
-
-def _rows_or_none(values: Any, n_rows: int, n_columns: int) -> Array | None:
-    if values is None:
+    if uv is None or np.shape(uv) != (n_vertices, 2) or not np.isfinite(uv).all():
         return None
-    array = np.array(values, np.float64)
-    usable = array.shape == (n_rows, n_columns) and np.isfinite(array).all()
-    return array if usable else None
+    return np.array(uv, np.float64)
 
 
 def finish_mesh(
-    vertices: Array, faces: Faces, uv: Array | None, normals: Array | None, name: str
+    vertices: Array, faces: Faces, uv: Array | None, name: str, *, smooth: bool = True
 ) -> SurfaceMesh:
-    """Mesh with the smooth normals and tangents it lacks.
+    """Mesh with normals and tangents made from its triangles and coordinates.
 
     Parameters
     ----------
@@ -100,11 +93,11 @@ def finish_mesh(
         Counter-clockwise seen from outside.
     uv : (n, 2) float64, optional
         Texture coordinates.
-    normals : (n, 3) float64, optional
-        Smooth normals; by angle-weighted mean of the faces if not given, over all
-        vertices in one place (seams of the coordinates stay smooth).
     name : str
         Name of the mesh.
+    smooth : bool
+        True for angle-weighted mean normals over all vertices in one place (seams of
+        the coordinates stay smooth), False for flat triangles.
 
     Returns
     -------
@@ -113,36 +106,45 @@ def finish_mesh(
     Examples
     --------
     >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    >>> flat = finish_mesh(corners, np.array([[0, 1, 2]], np.int32), corners[:, :2], None, "a")
+    >>> flat = finish_mesh(corners, np.array([[0, 1, 2]], np.int32), corners[:, :2], "a")
     >>> flat.normals[0], flat.tangents[0]
     (array([0., 0., 1.]), array([1., 0., 0.]))
     """
     faces = without_slivers(vertices, faces)
-    smooth = unit(_smooth_normals(vertices, faces) if normals is None else normals)
-    smooth[np.linalg.norm(smooth, axis=1) < 0.5] = [0.0, 0.0, 1.0]  # vertices of no face
-    has_uv = uv is not None
     coordinates = np.zeros((len(vertices), 2)) if uv is None else uv
+    if not smooth:  # no triangle shares a vertex with another
+        vertices, coordinates = vertices[faces.ravel()], coordinates[faces.ravel()]
+        faces = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
+    normals = _normals(vertices, faces, _places(vertices) if smooth else faces.ravel())
     return SurfaceMesh(
         vertices=vertices,
         faces=faces,
         uv=coordinates,
-        normals=smooth,
-        tangents=_tangents(vertices, faces, coordinates, smooth),
-        has_uv=has_uv,
+        normals=normals,
+        tangents=_tangents(vertices, faces, coordinates, normals),
+        has_uv=uv is not None,
         name=name,
     )
 
 
-def _smooth_normals(vertices: Array, faces: Faces) -> Array:
-    """Angle-weighted normals, shared by vertices in one place; (n, 3)."""
+def _places(vertices: Array) -> NDArray[np.intp]:
+    """Number of the place of each vertex; seams have several vertices in one place."""
     size = np.ptp(vertices, axis=0).max()
-    _, place = np.unique(np.round(vertices / (1e-7 * size)), axis=0, return_inverse=True)
+    rounded = np.round(vertices / (SAME_PLACE * size))
+    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].ravel())
+
+
+def _normals(vertices: Array, faces: Faces, places: NDArray[np.integer[Any]]) -> Array:
+    """Angle-weighted normals, shared by all vertices of a place; (n, 3)."""
     corners = vertices[faces]
     ahead = unit(np.roll(corners, -1, axis=1) - corners)
     back = unit(np.roll(corners, 1, axis=1) - corners)
     angle = np.arccos(np.clip(np.sum(ahead * back, axis=2), -1.0, 1.0))
     normal = unit(np.cross(ahead[:, 0], back[:, 0]))
-    return _scatter(place.ravel()[faces], normal[:, None] * angle[..., None])[place.ravel()]
+    total = _scatter(places[faces], normal[:, None] * angle[..., None], len(vertices))
+    normals = unit(total[places])
+    normals[np.linalg.norm(normals, axis=1) < 0.5] = [0.0, 0.0, 1.0]  # vertices of no face
+    return normals
 
 
 def _tangents(vertices: Array, faces: Faces, uv: Array, normals: Array) -> Array:
@@ -161,8 +163,7 @@ def _tangents(vertices: Array, faces: Faces, uv: Array, normals: Array) -> Array
     return unit(tangents)
 
 
-def _scatter(index: NDArray[np.int_] | Faces, values: Array, n_rows: int = 0) -> Array:
-    """Sum of `values` (m, 3, 3) over equal entries of `index` (m, 3)."""
-    flat, n_rows = index.ravel(), max(n_rows, int(index.max()) + 1)
+def _scatter(index: NDArray[np.integer[Any]], values: Array, n_rows: int) -> Array:
+    """Sum of `values` (m, 3, 3) over equal entries of `index` (m, 3), (n_rows, 3)."""
     columns = values.reshape(-1, 3).T
-    return np.stack([np.bincount(flat, c, n_rows) for c in columns], axis=1)
+    return np.stack([np.bincount(index.ravel(), c, n_rows) for c in columns], axis=1)

@@ -120,3 +120,40 @@ def unit(vectors: Array) -> Array:
     """Vectors divided by their lengths; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))
+
+
+def fan(rim: Array, normal: Array, tangent: Array, uv: Array | None = None) -> SurfaceMesh:
+    """Flat star-shaped face about the mean of a closed rim.
+
+    Parameters
+    ----------
+    rim : (n, 3) float64
+        Points in order, either way round.
+    normal, tangent : (3,) float64
+        Unit vectors; the face is seen from where the normal points.
+    uv : (n, 2) float64, optional
+        Texture coordinates of the rim; zeros if not given.
+
+    Returns
+    -------
+    SurfaceMesh
+
+    Examples
+    --------
+    >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    >>> fan(square, np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])).faces[0]
+    array([1, 0, 4], dtype=int32)
+    """
+    n, centre = len(rim), rim.mean(axis=0)
+    first = np.arange(n)
+    faces = np.stack([np.full(n, n), first, (first + 1) % n], axis=1)
+    if np.cross(rim - centre, np.roll(rim, -1, axis=0) - centre).sum(axis=0) @ normal < 0.0:
+        faces = faces[:, ::-1]
+    coordinates = np.zeros((n, 2)) if uv is None else uv
+    return SurfaceMesh(
+        vertices=np.vstack([rim, centre]),
+        faces=faces.astype(np.int32),
+        uv=np.vstack([coordinates, coordinates.mean(axis=0)]),
+        normals=np.tile(normal, (n + 1, 1)),
+        tangents=np.tile(tangent, (n + 1, 1)),
+    )

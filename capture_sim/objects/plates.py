@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from capture_sim.errors import scene_error
 from capture_sim.materials.textures import read_image
-from capture_sim.objects.mesh import Array, SurfaceMesh, grid_faces, joined, unit
+from capture_sim.objects.mesh import Array, SurfaceMesh, fan, grid_faces, joined, unit
 from capture_sim.tables import TableReader
 
 HeightField = Callable[[Array], Array]
@@ -85,14 +85,9 @@ def _box(top: SurfaceMesh) -> list[SurfaceMesh]:
         (index[::-1, 0], [-1.0, 0.0, 0.0]),
     ]
     parts = [_wall(top, border, np.array(normal)) for border, normal in walls]
-    corners = top.vertices[index[[0, 0, -1, -1], [0, -1, -1, 0]]] * [1.0, 1.0, 0.0]
-    bottom = SurfaceMesh(
-        vertices=corners,
-        faces=np.array([[0, 2, 1], [0, 3, 2]], np.int32),
-        uv=np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
-        normals=np.tile([0.0, 0.0, -1.0], (4, 1)),
-        tangents=np.tile([1.0, 0.0, 0.0], (4, 1)),
-    )
+    loop = np.concatenate([border[:-1] for border, _ in walls])
+    rim = top.vertices[loop] * [1.0, 1.0, 0.0]
+    bottom = fan(rim, np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0]), top.uv[loop])
     return [*parts, bottom]
 
 

@@ -70,7 +70,7 @@ def make_object(table: Table, folder: Path = Path()) -> SurfaceMesh:
               thickness (0: the relief alone), facets
     plane     size [x, y]
     mesh      file, scale or size (largest extent), centre, rotation_deg
-              [x, y, z] applied in that order, position
+              [x, y, z] applied in that order, position, smooth
     ========  ==============================================================
 
     Examples

@@ -11,6 +11,7 @@ from capture_sim.errors import scene_error
 from capture_sim.objects.mesh import (
     Array,
     SurfaceMesh,
+    fan,
     grid_faces,
     joined,
     unit,
@@ -225,7 +226,7 @@ def sweep(spine: Array, along: Array, radius: float, around: int) -> SurfaceMesh
     angle = np.linspace(0.0, 2.0 * np.pi, around + 1)
     sideways = np.array([0.0, 1.0, 0.0])
     outward = np.cross(sideways, along)
-    rim = np.cos(angle)[:, None, None] * outward + np.sin(angle)[:, None, None] * sideways
+    rim = np.cos(angle)[:, None, None] * outward - np.sin(angle)[:, None, None] * sideways
     rim[-1] = rim[0]
     u, v = np.meshgrid(np.linspace(0.0, 1.0, len(spine)), angle / (2.0 * np.pi))
     tube = SurfaceMesh(
@@ -236,23 +237,7 @@ def sweep(spine: Array, along: Array, radius: float, around: int) -> SurfaceMesh
         tangents=np.tile(along, (around + 1, 1)),
     )
     ends = [
-        _disc(spine[end] + radius * rim[:-1, end], sign * along[end], outward[end])
+        fan(spine[end] + radius * rim[:-1, end], sign * along[end], outward[end])
         for end, sign in ((0, -1.0), (-1, 1.0))
     ]
     return joined([tube, *ends], "tube")
-
-
-def _disc(rim: Array, normal: Array, tangent: Array) -> SurfaceMesh:
-    """Flat end of a tube: a fan about its centre."""
-    n = len(rim)
-    first = np.arange(n)
-    fan = np.stack([np.full(n, n), first, (first + 1) % n], axis=1)
-    if np.dot(np.cross(rim[0] - rim.mean(axis=0), rim[1] - rim[0]), normal) < 0.0:
-        fan = fan[:, ::-1]
-    return SurfaceMesh(
-        vertices=np.vstack([rim, rim.mean(axis=0)]),
-        faces=fan.astype(np.int32),
-        uv=np.zeros((n + 1, 2)),
-        normals=np.tile(normal, (n + 1, 1)),
-        tangents=np.tile(tangent, (n + 1, 1)),
-    )
