@@ -33,6 +33,11 @@ Array = NDArray[np.float64]
 TRUTH_VERSION = 1
 # Enough for percentiles to one part in a hundred; a second of work.
 HULL_SAMPLES = 20_000
+# Frames between surface points: a line through that many, of one material and
+# no farther apart in angle than a curved surface is between pixels.
+FRAME_NEIGHBOURS = 12
+NEIGHBOUR_COSINE = 0.85
+TEXELS_PER_BLOCK = 16_384
 # Surface points kept of all views together to match texels with.
 MAX_SURFACE_POINTS = 1_000_000
 
@@ -335,7 +340,8 @@ def frame_errors(
         Rows tangent, binormal, normal: recovered frames, or base frames for
         comparison. Frames that are not finite are left out.
     surface : SurfacePoints
-        From `surface_points`.
+        From `surface_points`. Between its points normals and tangents are
+        interpolated linearly, within one material.
     max_distance : float
         Texels farther than this from any true point are left out, metres: where
         the hull bridges a hollow, no texel shows one point of the surface.
@@ -368,18 +374,17 @@ def frame_errors(
     nothing = np.zeros(0, np.int64)
     if not len(surface.position):
         return FrameErrors(nothing, np.zeros(0), np.zeros(0), nothing)
-    distance, point = cKDTree(surface.position).query(
-        texels, distance_upper_bound=np.nextafter(max_distance, math.inf)
-    )
-    matched = np.flatnonzero(np.isfinite(distance) & np.isfinite(frames).all(axis=(1, 2)))
-    normal, tangent = surface.normal[point[matched]], surface.tangent[point[matched]]
-    to_tangent = angle_deg(frames[matched, 0], tangent)
-    return FrameErrors(
-        matched,
-        angle_deg(frames[matched, 2], normal),
-        np.minimum(to_tangent, 180.0 - to_tangent),
-        surface.label[point[matched]],
-    )
+    tree = cKDTree(surface.position)
+    distance, nearest = tree.query(texels)
+    usable = (distance <= max_distance) & np.isfinite(frames).all(axis=(1, 2))
+    matched, normals, tangents = np.flatnonzero(usable), [np.zeros(0)], [np.zeros(0)]
+    for first in range(0, len(matched), TEXELS_PER_BLOCK):
+        block = matched[first : first + TEXELS_PER_BLOCK]
+        normal, tangent = _interpolated_frames(tree, surface, texels[block])
+        normals.append(angle_deg(frames[block, 2], normal))
+        tangents.append(_line_angle_deg(frames[block, 0], tangent))
+    label = surface.label[nearest[matched]]
+    return FrameErrors(matched, np.concatenate(normals), np.concatenate(tangents), label)
 
 
 def angle_deg(a: ArrayLike, b: ArrayLike) -> Array:
@@ -579,6 +584,55 @@ def _seen_pixels(view: TruthView) -> tuple[Array, Array, Array, NDArray[np.int64
         a[seen].astype(np.float64) for a in (view.position, view.normal, view.tangent)
     )
     return position, normal, tangent, view.label[seen].astype(np.int64)
+
+
+def _interpolated_frames(
+    tree: cKDTree, surface: SurfacePoints, positions: Array
+) -> tuple[Array, Array]:
+    """Normals and tangents of the surface at positions between its points."""
+    count = min(FRAME_NEIGHBOURS, len(surface.position))
+    distance, near = tree.query(positions, k=range(1, count + 1))
+    offset = surface.position[near] - positions[:, None]
+    normal, tangent = surface.normal[near], surface.tangent[near]
+    alike = (surface.label[near] == surface.label[near[:, :1]]) & (
+        np.einsum("nkd,nd->nk", normal, normal[:, 0]) > NEIGHBOUR_COSINE
+    )
+    reach = np.maximum(distance[:, -1:], 1e-300)
+    weight = alike * np.exp(-2.0 * (distance / reach) ** 2)
+    # Tangents are lines: turn all to the side of the nearest.
+    side = np.where(np.einsum("nkd,nd->nk", tangent, tangent[:, 0]) < 0.0, -1.0, 1.0)
+    vectors = np.concatenate([normal, side[..., None] * tangent], axis=2)
+    fitted = _value_at_origin(offset / reach[..., None], vectors, weight)
+    return fitted[:, :3], fitted[:, 3:]
+
+
+def _value_at_origin(offset: Array, values: Array, weight: Array) -> Array:
+    r"""Constant part of a weighted linear fit, for every row.
+
+    Minimises :math:`\sum_k w_k |v_k - a - B x_k|^2 + \epsilon |B|^2`; the second
+    term keeps slopes at 0 in directions without points, such as the normal.
+
+    Parameters
+    ----------
+    offset : (n, k, 3) float64
+    values : (n, k, d) float64
+    weight : (n, k) float64
+
+    Returns
+    -------
+    (n, d) float64
+    """
+    design = np.concatenate([np.ones_like(offset[..., :1]), offset], axis=2)
+    weighted = weight[..., None] * design
+    gram = np.einsum("nki,nkj->nij", weighted, design)
+    gram[:, [1, 2, 3], [1, 2, 3]] += 1e-3 * gram[:, :1, 0]
+    solved = np.linalg.solve(gram, np.einsum("nki,nkd->nid", weighted, values))
+    return np.asarray(solved[:, 0])
+
+
+def _line_angle_deg(a: Array, b: Array) -> Array:
+    angle = angle_deg(a, b)
+    return np.minimum(angle, 180.0 - angle)
 
 
 def _relative_error(got: Array, want: Array) -> float:

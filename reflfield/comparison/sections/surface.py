@@ -194,9 +194,9 @@ def coverage_section(
             tuple(
                 (
                     k,
-                    100 * float(np.mean(v == 0)),
+                    f"{100 * np.mean(v == 0):.2f}",
                     float(np.median(v)),
-                    float(v.mean()),
+                    f"{v.mean():.1f}",
                     int(v.max()),
                 )
                 for k, v in counts.items()
