@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.alignment.expectation import TargetFit, fit_targets
+from reflfield.alignment.expectation import TargetFit, fit_targets, mean_targets
 from reflfield.alignment.gauge import Gauged, fix_gauge, fold
-from reflfield.alignment.searching import search
+from reflfield.alignment.refinement import (
+    NodeTargets,
+    RefinementOptions,
+    SampleSet,
+    improve_frames,
+    refine_targets,
+)
+from reflfield.alignment.searching import SearchOptions, SearchResult, search
 from reflfield.checks import check_shape, unit_directions
 from reflfield.errors import InputError, ShapeError
 from reflfield.progress import track
@@ -24,6 +30,8 @@ from reflfield.sphere.projection import Projector
 TRAINING_TEXELS = 8192
 TRAINING_BYTES = 256 * 2**20
 BLOCK_BYTES = 64 * 2**20
+# Samples kept for the targets of the refinement.
+REFINING_BYTES = 256 * 2**20
 
 
 class SampleSource(Protocol):
@@ -178,10 +186,56 @@ def align(
         max_tilt=max_tilt,
         n_threads=n_threads,
     )
-    # Give the frames a meaning, then search all texels that have not been searched.
+    # Give the frames a meaning, and sharpen the targets on samples.
     weights = np.where(training.norms() > 0, np.maximum(fit.found.score, 0.0), 0.0)
     gauged = fix_gauge(fit.targets, fit.found.rotations, fit.found.cluster, weights)
-    return _finish(task, rows, fit, gauged)
+    fit = replace(
+        fit, targets=gauged.targets, found=replace(fit.found, rotations=gauged.rotations)
+    )
+    sharp = _sharpen(task, rows, training, fit, RefinementOptions()) if refine else None
+    # Find the frames of all texels, block by block.
+    return _finish(task, rows, fit, gauged, sharp)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sharp:
+    """Targets on samples, in the gauge of the harmonic targets; `regauged` follows both."""
+
+    targets: NodeTargets
+    options: RefinementOptions
+    regauged: Gauged
+
+
+def _sharpen(
+    task: _Task,
+    rows: NDArray[np.int64],
+    training: Coupled,
+    fit: TargetFit,
+    options: RefinementOptions,
+) -> _Sharp:
+    """Refine some training texels, and fix the gauge again from their better frames."""
+    n_clusters = len(fit.targets)
+    each = 4 * task.source.shape[1] * task.source.shape[2]
+    most = min(options.texels_per_cluster * n_clusters, max(REFINING_BYTES // each, 64))
+    some = np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))
+    parts = [
+        _unit_samples(_read(task.source, part)) for part in _blocks(task.source, rows[some])
+    ]
+    data = SampleSet(np.concatenate(parts), task.projector.views, task.projector.lights)
+    found = fit.found
+    frames = np.ascontiguousarray(np.swapaxes(found.rotations[some], 1, 2))
+    cluster = found.cluster[some]
+    targets, frames = refine_targets(data, frames, cluster, n_clusters, options, task.n_threads)
+    better = replace(
+        found,
+        rotations=np.ascontiguousarray(np.swapaxes(frames, 1, 2)),
+        cluster=cluster,
+        score=found.score[some],
+    )
+    weights = np.where(data.brightness() > 0, np.maximum(better.score, 0.0), 0.0)
+    means = mean_targets(training[some], weights, better, n_clusters)
+    regauged = fix_gauge(means, better.rotations, cluster, weights)
+    return _Sharp(targets, options, regauged)
 
 
 def _as_source(samples: ArrayLike | SampleSource) -> SampleSource:
@@ -282,32 +336,75 @@ def couple_samples(task: _Task, block: NDArray[np.float32]) -> Coupled:
     return couple(task.projector.project(task.projector.fill(block, task.prior)))
 
 
-def _finish(task: _Task, rows: NDArray[np.int64], fit: TargetFit, gauged: Gauged) -> Alignment:
-    """Frames of all texels: those of the training, and the search of the rest."""
+def _finish(
+    task: _Task,
+    rows: NDArray[np.int64],
+    fit: TargetFit,
+    gauged: Gauged,
+    sharp: _Sharp | None,
+) -> Alignment:
+    """Frames of all texels: search those not in the training, refine all."""
     n = task.source.shape[0]
-    base_from_local = np.tile(np.eye(3), (n, 1, 1))
-    cluster = np.zeros(n, np.int32)
-    score, margin = np.zeros(n), np.zeros(n)
-    base_from_local[rows], cluster[rows] = gauged.rotations, fit.found.cluster
-    score[rows], margin[rows] = fit.found.score, fit.found.margin
-    for part in _remaining(task.source, n, rows):
-        found = search(
-            _coupled(task, part),
-            gauged.targets,
-            max_tilt=task.max_tilt,
-            n_threads=task.n_threads,
-        )
-        base_from_local[part] = _fold_all(found.rotations, found.cluster, gauged)
-        cluster[part], score[part], margin[part] = found.cluster, found.score, found.margin
+    found = SearchResult(
+        rotations=np.tile(np.eye(3), (n, 1, 1)),
+        score=np.zeros(n),
+        margin=np.zeros(n),
+        cluster=np.zeros(n, np.int32),
+    )
+    _put(found, rows, fit.found)
+    trained = np.zeros(n, bool)
+    trained[rows] = True
+    blocks = _blocks(task.source, np.arange(n) if sharp else np.flatnonzero(~trained))
+    for part in track(blocks, len(blocks), "frames of all texels"):
+        samples = _unit_samples(_read(task.source, part))
+        new = ~trained[part]
+        if new.any():
+            source = couple_samples(task, samples[new])
+            options: SearchOptions = {"max_tilt": task.max_tilt, "n_threads": task.n_threads}
+            _put(found, part[new], search(source, gauged.targets, **options))
+        if sharp:
+            _refine_block(task, part, samples, found, sharp)
+    last = sharp.regauged if sharp else gauged
+    base_from_local = _fold_all(found.rotations, found.cluster, last)
     return Alignment(
         local_from_base=np.ascontiguousarray(np.swapaxes(base_from_local, 1, 2)),
-        cluster=cluster,
-        score=score,
-        margin=margin,
+        cluster=found.cluster,
+        score=found.score,
+        margin=found.margin,
         history=fit.history,
-        targets=gauged.targets,
-        symmetries=tuple(symmetry.kind for symmetry in gauged.symmetries),
+        targets=last.targets,
+        symmetries=tuple(symmetry.kind for symmetry in last.symmetries),
     )
+
+
+def _put(into: SearchResult, rows: NDArray[np.int64], part: SearchResult) -> None:
+    into.rotations[rows], into.score[rows] = part.rotations, part.score
+    into.margin[rows], into.cluster[rows] = part.margin, part.cluster
+
+
+def _refine_block(
+    task: _Task,
+    part: NDArray[np.int64],
+    samples: NDArray[np.float32],
+    found: SearchResult,
+    sharp: _Sharp,
+) -> None:
+    """Refine the frames of one block against the finished targets, in place."""
+    data = SampleSet(samples, task.projector.views, task.projector.lights)
+    frames = np.ascontiguousarray(np.swapaxes(found.rotations[part], 1, 2))
+    cluster = found.cluster[part]
+    improve_frames(
+        data,
+        frames,
+        data.brightness(),
+        cluster,
+        sharp.targets,
+        sharp.options,
+        sharp.options.last_steps,
+        task.n_threads,
+    )
+    turns = sharp.regauged.turns[cluster]
+    found.rotations[part] = np.swapaxes(frames, 1, 2) @ turns
 
 
 def _fold_all(
@@ -317,12 +414,3 @@ def _fold_all(
     for k, symmetry in enumerate(gauged.symmetries):
         folded[cluster == k] = fold(rotations[cluster == k], symmetry)
     return folded
-
-
-def _remaining(
-    source: SampleSource, n: int, rows: NDArray[np.int64]
-) -> Iterator[NDArray[np.int64]]:
-    """Blocks of the texels that are not among `rows`."""
-    rest = np.setdiff1d(np.arange(n), rows, assume_unique=True)
-    blocks = _blocks(source, rest)
-    return track(blocks, len(blocks), "frames of all texels")

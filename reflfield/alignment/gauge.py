@@ -141,11 +141,14 @@ class Gauged:
         `base_from_local`.
     symmetries : tuple of Symmetry
         One a cluster.
+    turns : (n_clusters, 3, 3) float64
+        What was multiplied to each cluster's rotations from the right, before folding.
     """
 
     targets: Coupled
     rotations: NDArray[np.float64]
     symmetries: tuple[Symmetry, ...]
+    turns: NDArray[np.float64]
 
 
 def fix_gauge(
@@ -185,7 +188,7 @@ def fix_gauge(
             rotations[cluster == k] = fold(rotations[cluster == k] @ turns[k], kind)
         symmetries.append(kind)
     blocks = rotation_blocks(np.swapaxes(turns, 1, 2), targets.n_degrees, str(targets.dtype))
-    return Gauged(rotate_coupled(targets, blocks), rotations, tuple(symmetries))
+    return Gauged(rotate_coupled(targets, blocks), rotations, tuple(symmetries), turns)
 
 
 def _normal_first(target: Coupled) -> NDArray[np.float64]:

@@ -109,8 +109,8 @@ class DirectionOperator:
         Coefficients to samples; zero rows below the horizon.
     """
 
-    analysis: NDArray[np.float64]
-    synthesis: NDArray[np.float64]
+    analysis: NDArray[np.floating]
+    synthesis: NDArray[np.floating]
 
 
 def direction_operator(
@@ -165,7 +165,7 @@ def direction_operator(
     gram = np.asarray(
         weighted.T @ synthesis + lower_gram(band_limit) + smoothing * roughness, np.float64
     )
-    analysis: NDArray[np.float64] = np.linalg.solve(gram, weighted.T)
+    analysis = np.linalg.solve(gram, weighted.T)
     above = (vectors[:, 2:] > 0.0).astype(np.float64)
     return DirectionOperator(analysis, synthesis * above)
 
