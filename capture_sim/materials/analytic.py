@@ -187,7 +187,9 @@ class GGX(_Parametric):
         masking = smith_visibility(views, lights, alphas, correlated=self.correlated)
         lobe = ggx_density(halves, alphas) * masking
         shine = lobe * self._fresnel(cosine, uv)
-        at_normal = self._fresnel(np.ones_like(cosine), uv)
+        if self.diffuse.bounds == (0.0, 0.0):
+            return shine
+        at_normal = self._fresnel(np.ones((1, 1)), uv)
         return shine + coupled_diffuse(self.diffuse.rgb(uv), at_normal, views, lights)
 
     def _fresnel(self, cosine: Array, uv: Array) -> Array:

@@ -127,7 +127,7 @@ def schlick(reflectance: Array, cosine: Array) -> Array:
     >>> schlick(np.array([[0.04]]), np.array([[0.5]])).round(3)
     array([[0.07]])
     """
-    return reflectance + (1.0 - reflectance) * (1.0 - np.minimum(cosine, 1.0)) ** 5
+    return reflectance + (1.0 - reflectance) * _fifth_power(1.0 - np.minimum(cosine, 1.0))
 
 
 def coupled_diffuse(albedo: Array, specular: Array, views: Array, lights: Array) -> Array:
@@ -161,6 +161,12 @@ def coupled_diffuse(albedo: Array, specular: Array, views: Array, lights: Array)
     >>> coupled_diffuse(np.ones((1, 1)), np.zeros((1, 1)), up, up).round(4)
     array([[0.3637]])
     """
-    view_part = 1.0 - (1.0 - 0.5 * views[:, 2:]) ** 5
-    light_part = 1.0 - (1.0 - 0.5 * lights[:, 2:]) ** 5
+    view_part = 1.0 - _fifth_power(1.0 - 0.5 * views[:, 2:])
+    light_part = 1.0 - _fifth_power(1.0 - 0.5 * lights[:, 2:])
     return 28.0 / (23.0 * np.pi) * albedo * (1.0 - specular) * view_part * light_part
+
+
+def _fifth_power(x: Array) -> Array:
+    """``x ** 5`` by products, an order of magnitude faster than the general power."""
+    squared = x * x
+    return squared * squared * x
