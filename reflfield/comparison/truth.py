@@ -625,7 +625,7 @@ def _value_at_origin(offset: Array, values: Array, weight: Array) -> Array:
     design = np.concatenate([np.ones_like(offset[..., :1]), offset], axis=2)
     weighted = weight[..., None] * design
     gram = np.einsum("nki,nkj->nij", weighted, design)
-    gram[:, [1, 2, 3], [1, 2, 3]] += 1e-3 * gram[:, :1, 0]
+    gram[:, [1, 2, 3], [1, 2, 3]] += 1e-6 * gram[:, :1, 0]
     solved = np.linalg.solve(gram, np.einsum("nki,nkd->nid", weighted, values))
     return np.asarray(solved[:, 0])
 
