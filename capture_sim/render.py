@@ -28,8 +28,8 @@ from capture_sim.surface import SurfacePoints, surface_points
 Table = Mapping[str, Any]
 Array = NDArray[np.float64]
 
-# Pairs of point and light shaded at once: temporaries stay near 100 MB and in cache reach.
-PAIRS_PER_BLOCK = 1 << 17
+# Pairs of point and light shaded at once: temporaries stay near 50 MB.
+PAIRS_PER_BLOCK = 1 << 16
 # Values of all photographs of one view held at once, before they are written.
 VALUES_PER_BATCH = 1 << 25
 # Rays searched for outlines at once.

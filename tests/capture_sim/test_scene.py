@@ -95,11 +95,15 @@ def test_unknown_scenes_list_the_shipped_ones():
 
 
 @pytest.mark.parametrize("name", shipped_scenes())
-def test_shipped_scenes_load_and_see_their_object(name):
+def test_shipped_scenes_load_and_hold_their_object_in_the_picture(name):
     scene = load_scene(name)
     assert scene.name == name
     assert scene.description
     for camera in scene.cameras:
         pose = np.array(camera["camera_from_world"])
-        position = pose[:3, :3] @ scene.mesh.centre + pose[:3, 3]
-        assert position[2] > 0 or camera["model"] == "orthographic"
+        local = scene.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        depth = np.ones((1, 1)) if camera["model"] == "orthographic" else local[:, 2:]
+        pixels = local[:, :2] / depth * camera["fl_x"] + [camera["cx"], camera["cy"]]
+        assert (depth > 0).all()
+        assert (pixels > 0).all()
+        assert (pixels < [camera["w"], camera["h"]]).all()
