@@ -239,7 +239,8 @@ class ReflectanceField:
         """(n_clusters, n_view_nodes, n_light_nodes, K + 1, 3): mean, then basis.
 
         Component and channel run fastest, so that one tap reads one run of
-        memory.
+        memory. This is the largest thing a field needs: 31 MB for 16 clusters of
+        10 components on 11 x 11 nodes for each direction, 411 MB on 21 x 21.
         """
         mean = self.mean
         n_clusters, n_views, n_lights, _ = mean.shape
