@@ -59,7 +59,7 @@ class SilhouetteOptions:
 
     border: float = 0.015
     uniform_spread: float = 0.25
-    least_contrast: float = 0.1
+    least_contrast: float = 0.02
     margin: float = 0.015
     crack: float = 0.02
     closing: float = 0.036
@@ -117,7 +117,7 @@ def silhouette_from_photographs(
     difference = np.abs(encoded - backdrop).max(axis=2)
     uniform = np.quantile(difference[border], 0.75) < options.uniform_spread
     if uniform:
-        inside = _differs_from_backdrop(difference, options)
+        inside = _differs_from_backdrop(difference, border, options)
     else:
         inside = _grabcut(encoded, border, options)
     seen, inside = inside, _cleaned(inside, options)
@@ -164,23 +164,36 @@ def _border(height: int, width: int, fraction: float) -> Bool:
     return border
 
 
-def _differs_from_backdrop(difference: Float32, options: SilhouetteOptions) -> Bool:
-    """Pixels that differ from the backdrop, or differ a little and touch such ones.
+def _differs_from_backdrop(
+    difference: Float32, border: Bool, options: SilhouetteOptions
+) -> Bool:
+    """Pixels that differ from the backdrop, or differ a little and are near such ones.
 
-    The strong threshold is Otsu's; the weak one lies just above what the backdrop varies by
-    at some distance from the strong pixels.
+    Both thresholds follow what the backdrop itself varies by; the upper one is at most
+    Otsu's, which splits the image's two levels.
     """
+    n = max(3, round(options.margin * max(difference.shape)))
     levels = np.clip(difference * 255, 0, 255).astype(np.uint8)
     otsu = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0] / 255
-    strong = max(otsu, options.least_contrast)
-    n = max(3, round(options.margin * max(difference.shape)))
-    near = cv2.dilate((difference > strong).astype(np.uint8), _disc(n))
-    far = difference[near == 0]
-    variation = float(np.quantile(far, 0.99)) if far.size else 0.0
+    bright = (difference > max(otsu, options.least_contrast)).astype(np.uint8)
+    far = cv2.dilate(bright, _disc(n)) == 0
+    variation = _variation(difference, border, far)
+    strong = float(np.clip(3 * variation, 2 * options.least_contrast, max(otsu, 0.1)))
     weak = float(np.clip(1.25 * variation, options.least_contrast, 0.75 * strong))
     smooth = cv2.GaussianBlur(difference, (0, 0), 0.7)
-    reached = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
-    return _touching((smooth > weak) & reached, smooth > strong)
+    near = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
+    return _touching((smooth > weak) & near, smooth > strong)
+
+
+def _variation(difference: Float32, border: Bool, far: Bool) -> float:
+    """How far the backdrop strays from its median colour.
+
+    Seen far from the bright pixels, where dark parts of the object may hide, and in the
+    border, which the object may cross: the smaller of both, and the border is farther from
+    the light that the object scatters.
+    """
+    in_border = 2.5 * float(np.quantile(difference[border], 0.95)) + 1 / 255
+    return min(in_border, float(np.quantile(difference[far], 0.99)) if far.any() else 0.0)
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:

@@ -47,6 +47,10 @@ class TestExact:
         assert on_axis == pytest.approx(1, rel=1e-14)
         assert within == pytest.approx(np.cos(0.15) ** 2, rel=1e-14)
         assert outside == 0
+        # a quarter of the way, in cosine, from dark to bright: smoothstep 5/32
+        angle = np.arccos(0.75 * np.cos(0.5) + 0.25 * np.cos(0.2))
+        edge = light.irradiance([[np.tan(angle), 0, 0]])[0, 0]
+        assert edge == pytest.approx(5 / 32 * np.cos(angle) ** 2, rel=1e-12)
 
     def test_spot_exponent(self):
         light = Light("l", "spot", position=[0, 0, 1], direction=[0, 0, -1], exponent=4)
