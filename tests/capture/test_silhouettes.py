@@ -143,8 +143,8 @@ def test_simulated_dome_photographs(shared_data):
     for view in (0, 9, 21):
         chosen = capture.photograph_index[view, ::4]
         found = silhouette_from_photographs(capture.read_photograph(int(i)) for i in chosen)
-        # some of it is in shadow under all of them; measured with 32 lights: .96 to .97
-        assert overlap(found, capture.read_silhouette(view)) > 0.94
+        # some of it is in shadow under all of them: .935 to .966 measured over all views
+        assert overlap(found, capture.read_silhouette(view)) > 0.92
 
 
 class TestMiddlebury:
