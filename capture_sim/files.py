@@ -35,6 +35,18 @@ def write_exr(path: Path, radiance: NDArray[np.float32]) -> None:
         file.write(str(path))
 
 
+def write_png(path: Path, encoded: NDArray[np.uint8]) -> None:
+    """Write an 8-bit image as it is.
+
+    Parameters
+    ----------
+    path : Path
+    encoded : (h, w) or (h, w, 3) uint8
+        Grey or sRGB.
+    """
+    Image.fromarray(encoded).save(path, format="PNG")
+
+
 def write_silhouette(path: Path, coverage: NDArray[np.float32]) -> None:
     """Write coverage in [0, 1] as an 8-bit grey PNG, white = object.
 
@@ -43,8 +55,7 @@ def write_silhouette(path: Path, coverage: NDArray[np.float32]) -> None:
     path : Path
     coverage : (h, w) float32
     """
-    grey = np.rint(coverage * 255.0).astype(np.uint8)
-    Image.fromarray(grey).save(path, format="PNG")
+    write_png(path, np.rint(coverage * 255.0).astype(np.uint8))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -22,6 +22,7 @@ from capture_sim.effects import (
     antialiasing,
     interreflection,
     near_lights,
+    quantisation,
     sensor_noise,
     shadows,
 )
@@ -32,7 +33,7 @@ from capture_sim.render import ViewSamples, sample_view, shade
 from capture_sim.scene import Scene
 from capture_sim.truth import write_view_truth
 
-EFFECTS = (antialiasing, near_lights, shadows, sensor_noise, interreflection)
+EFFECTS = (antialiasing, near_lights, shadows, sensor_noise, quantisation, interreflection)
 
 # Enough to average over near and far sides of the object, few enough to take no time.
 TRIAL_VIEWS = 3

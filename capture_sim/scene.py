@@ -23,6 +23,7 @@ A scene file holds the tables below; only `object`, `material`, `cameras` and
 
     [effects]
     shadows = "auto"                 # "on", "off"
+    exposure_seconds = [0.1, 1.0]    # bracketed 8-bit PNGs; linear EXR if left out
     [effects.sensor_noise]
     electrons_per_radiance = 1e5
     read_noise = 2.0                 # electrons
@@ -46,7 +47,7 @@ from capture_sim.dome import make_cameras, make_lights
 from capture_sim.errors import SceneError, scene_error
 from capture_sim.materials import Material, make_material
 from capture_sim.objects import SurfaceMesh, make_object
-from capture_sim.tables import TableReader
+from capture_sim.tables import TableReader, check_number
 
 Table = Mapping[str, Any]
 
@@ -96,10 +97,13 @@ class EffectOptions:
         ``"auto"``, ``"on"`` or ``"off"``.
     sensor_noise : NoiseOptions or None
         None for a perfect sensor.
+    exposure_seconds : tuple of float
+        Exposure times of bracketed 8-bit photographs; none for linear ones.
     """
 
     shadows: str = "auto"
     sensor_noise: NoiseOptions | None = None
+    exposure_seconds: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -326,8 +330,20 @@ def _effect_options(table: Table) -> EffectOptions:
     reader = TableReader("effects", table)
     shadows = reader.choice("shadows", "auto", ("auto", "on", "off"))
     noise = reader.take("sensor_noise")
+    seconds = reader.take("exposure_seconds")
     reader.finish()
-    return EffectOptions(shadows, None if noise is None else _noise_options(noise))
+    return EffectOptions(
+        shadows=shadows,
+        sensor_noise=None if noise is None else _noise_options(noise),
+        exposure_seconds=() if seconds is None else _exposure_seconds(seconds),
+    )
+
+
+def _exposure_seconds(value: Any) -> tuple[float, ...]:
+    what = "effects.exposure_seconds"
+    if not isinstance(value, list) or not 1 <= len(value) <= 64:
+        raise scene_error(what, "a list of 1 to 64 exposure times", value)
+    return tuple(check_number(what, time, low=1e-9, high=1e9) for time in value)
 
 
 def _noise_options(table: Table) -> NoiseOptions:

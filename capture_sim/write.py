@@ -12,13 +12,19 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from capture_sim.effects import sensor_noise
+from capture_sim.effects.quantisation import expose
 from capture_sim.errors import scene_error
-from capture_sim.files import write_exr, write_json, write_silhouette
+from capture_sim.files import write_exr, write_json, write_png, write_silhouette
 from capture_sim.rays import RayTracer
 from capture_sim.render import render_view, sample_view
 from capture_sim.scene import Scene
 from capture_sim.truth import write_truth, write_view_truth
+
+Table = Mapping[str, Any]
 
 GENERATOR = "capture_sim"
 CAPTURE_FILE = "capture.json"
@@ -146,13 +152,34 @@ def _write_view(scene: Scene, tracer: RayTracer, index: int, folder: Path) -> No
     for light, radiance in render_view(scene, tracer, view):
         if noise is not None:
             radiance = sensor_noise.add_noise(radiance, noise, (scene.seed, index, light))
-        name = f"{camera['id']}_{scene.lights[light]['id']}.exr"
-        write_exr(folder / "photographs" / name, radiance)
+        _write_photograph(scene, folder, camera, scene.lights[light], radiance)
     if scene.truth.per_view:
         write_view_truth(scene, tracer, camera, folder)
 
 
-def _silhouette(camera: Mapping[str, Any]) -> str:
+def _write_photograph(
+    scene: Scene, folder: Path, camera: Table, light: Table, radiance: NDArray[np.float32]
+) -> None:
+    if not scene.effects.exposure_seconds:
+        write_exr(folder / _photograph(camera["id"], light["id"]), radiance)
+    for exposure in _exposures(scene, camera, light):
+        write_png(folder / exposure["file"], expose(radiance, exposure["seconds"]))
+
+
+def _photograph(camera: str, light: str) -> str:
+    return f"photographs/{camera}_{light}.exr"
+
+
+def _exposures(scene: Scene, camera: Table, light: Table) -> list[dict[str, Any]]:
+    """Files and times of a bracketed photograph; empty for linear ones."""
+    stem = f"photographs/{camera['id']}_{light['id']}"
+    return [
+        {"file": f"{stem}_e{index}.png", "seconds": seconds}
+        for index, seconds in enumerate(scene.effects.exposure_seconds)
+    ]
+
+
+def _silhouette(camera: Table) -> str:
     return f"silhouettes/{camera['id']}.png"
 
 
@@ -177,6 +204,20 @@ def capture_description(scene: Scene) -> dict[str, Any]:
         "base_geometry": scene.base_geometry,
         "cameras": [{**camera, "silhouette": _silhouette(camera)} for camera in scene.cameras],
         "lights": [dict(light) for light in scene.lights],
-        "photographs": {"pattern": "photographs/{camera}_{light}.exr"},
+        "photographs": _photograph_list(scene),
         "truth": "truth/truth.json",
     }
+
+
+def _photograph_list(scene: Scene) -> dict[str, str] | list[dict[str, Any]]:
+    if not scene.effects.exposure_seconds:
+        return {"pattern": _photograph("{camera}", "{light}")}
+    return [
+        {
+            "camera": camera["id"],
+            "light": light["id"],
+            "exposures": _exposures(scene, camera, light),
+        }
+        for camera in scene.cameras
+        for light in scene.lights
+    ]

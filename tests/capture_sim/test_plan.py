@@ -33,6 +33,7 @@ def test_counts_and_decisions():
         "near lights": True,
         "shadows": False,
         "sensor noise": False,
+        "8-bit exposures": False,
         "interreflection": False,
     }
     assert all(effect.reason for effect in decided.effects)

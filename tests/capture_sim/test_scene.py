@@ -47,6 +47,8 @@ def test_defaults():
             {"effects": {"sensor_noise": {"electrons_per_radiance": 1, "read_noise": -1}}},
             r"read_noise: expected a number",
         ),
+        ({"effects": {"exposure_seconds": [1.0, 0.0]}}, r"exposure_seconds: expected a number"),
+        ({"effects": {"exposure_seconds": 1.0}}, r"exposure_seconds: expected a list"),
         ({"heldout": {"frames": -2}}, r"heldout\.frames"),
         ({"truth": {"per_view": 1}}, r"truth\.per_view: expected true or false"),
     ],

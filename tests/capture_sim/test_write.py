@@ -191,3 +191,20 @@ def test_the_reader_reads_the_writer(capture):
     np.testing.assert_allclose(
         read.lights[2].irradiance(position)[:, 0], intensity / distance2, rtol=1e-12
     )
+
+
+def test_bracketed_exposures_merge_to_the_linear_photograph(tmp_path):
+    from reflfield.capture.readers import open_capture
+
+    plain = {"heldout": {"frames": 0}, "truth": {"points": 0, "per_view": False}}
+    linear = write_capture(scene(effects={}, **plain), tmp_path / "linear")
+    times = {"exposure_seconds": [0.02, 0.2, 2.0]}
+    bracketed = write_capture(scene(effects=times, **plain), tmp_path / "bracketed")
+    description = json.loads((bracketed / "capture.json").read_text())
+    jsonschema.validate(description, json.loads(SCHEMA.read_text()))
+    expected = open_capture(linear).read_photograph(4)
+    merged = open_capture(bracketed).read_photograph(4)
+    assert expected.max() > 0.5  # two of the exposures saturate
+    # Half a step of 1/255 near the dark end of a useful exposure is 2 % of its value;
+    # the darkest value that the longest exposure tells from black is 1.5e-4.
+    np.testing.assert_allclose(merged, expected, rtol=0.03, atol=2e-4)
