@@ -2,17 +2,62 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.checks import check_shape
-from reflfield.errors import InputError
+from reflfield.errors import GeometryError, InputError
+from reflfield.geometry.box_charts import box_charts
 from reflfield.geometry.mesh import Mesh
 
 Array = NDArray[np.float64]
+
+_METHODS = ("xatlas", "boxes")
+
+
+@dataclass(frozen=True)
+class AtlasOptions:
+    """How the surface is cut and laid out.
+
+    Parameters
+    ----------
+    resolution : int
+        Side of the square texture, texels; about 3/4 of them will be used.
+    padding : int
+        Empty texels between charts.
+    time_limit_s : float
+        xatlas is stopped after this time and the simpler charts are used.
+    max_cost : float
+        Growth of xatlas' charts: higher gives fewer, more distorted charts.
+    method : {"xatlas", "boxes"}
+        "boxes": charts by the six main directions, always fast, many seams.
+    """
+
+    resolution: int = 256
+    padding: int = 2
+    time_limit_s: float = 120.0
+    max_cost: float = 4.0
+    method: str = "xatlas"
+
+    def __post_init__(self) -> None:
+        if self.method not in _METHODS:
+            raise InputError(
+                f"method: expected one of {', '.join(_METHODS)}, received {self.method!r}"
+            )
+        if self.resolution < 4 or self.padding < 0 or not self.time_limit_s > 0:
+            raise InputError(
+                "atlas: expected resolution >= 4, padding >= 0 and time_limit_s > 0, received "
+                f"{self.resolution}, {self.padding} and {self.time_limit_s}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,3 +145,118 @@ _COLUMNS = {
     "chart": np.int32,
     "normals": np.float64,
 }
+
+
+class AtlasWarning(UserWarning):
+    """The atlas was made by the simpler method."""
+
+
+def build_atlas(mesh: Mesh, options: AtlasOptions | None = None) -> Atlas:
+    """Cut a mesh into charts and pack them into a square texture.
+
+    xatlas runs in a process of its own under a time limit. If it fails or takes too
+    long, the simple charts of `box_charts` are used and a warning says so.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        About 20,000 smooth triangles unwrap in a few seconds into some tens of charts;
+        raw marching cubes would give thousands.
+    options : AtlasOptions, optional
+
+    Returns
+    -------
+    Atlas
+        Faces in the order of `mesh`; smooth normals carried over from it.
+
+    Raises
+    ------
+    GeometryError
+        If the mesh has no area, or its charts do not fit into the texture at all.
+    """
+    options = options or AtlasOptions()
+    if not mesh.area > 0.0:
+        raise GeometryError("mesh: expected a surface with area, received none")
+    if options.method == "xatlas":
+        try:
+            return _xatlas_atlas(mesh, options)
+        except (subprocess.SubprocessError, OSError, ValueError) as error:
+            warnings.warn(
+                f"xatlas did not answer ({error}); the atlas is made of box charts",
+                AtlasWarning,
+                stacklevel=2,
+            )
+    charts = box_charts(mesh, options.resolution, options.padding)
+    return _assembled(
+        mesh, charts.source_vertex, charts.faces, charts.chart, charts.uv, options
+    )
+
+
+def _xatlas_atlas(mesh: Mesh, options: AtlasOptions) -> Atlas:
+    # Area 1 around the origin: xatlas works in single precision with fixed tolerances.
+    unit = (mesh.vertices - mesh.bounds.mean(axis=0)) / np.sqrt(mesh.area)
+    job = {
+        "positions": unit.astype(np.float32),
+        "normals": mesh.vertex_normals.astype(np.float32),
+        "faces": mesh.faces.astype(np.uint32),
+        "resolution": np.array(options.resolution),
+        "padding": np.array(options.padding),
+        "max_cost": np.array(options.max_cost),
+    }
+    made = _run_worker(job, options.time_limit_s)
+    faces, chart = made["faces"].astype(np.int64), made["chart"].astype(np.int64)
+    source = made["source_vertex"].astype(np.int64)
+    if not np.array_equal(source[faces], mesh.faces):
+        raise ValueError("xatlas returned other triangles")
+    uv = made["uv"].astype(np.float64) / options.resolution
+    uncharted = chart < 0
+    # Faces without area belong to no chart: they become a point of the first one.
+    uv[faces[uncharted]] = uv[faces[np.argmax(~uncharted), 0]]
+    chart[uncharted] = 0
+    return _assembled(mesh, source, faces, chart, uv, options)
+
+
+def _run_worker(
+    job: dict[str, NDArray[np.generic]], time_limit_s: float
+) -> dict[str, NDArray[np.generic]]:
+    """Hand the job to `xatlas_worker` and wait for its answer."""
+    package_parent = str(Path(__file__).resolve().parents[2])
+    paths = [package_parent, os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    with tempfile.TemporaryDirectory(prefix="reflfield-") as folder:
+        source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
+        np.savez(source, allow_pickle=False, **job)
+        worker = "reflfield.geometry.xatlas_worker"
+        done = subprocess.run(
+            [sys.executable, "-m", worker, str(source), str(target)],
+            env=environment,
+            timeout=time_limit_s,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode != 0:
+            reason = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
+            raise ValueError(reason[0])
+        with np.load(target, allow_pickle=False) as made:
+            return dict(made)
+
+
+def _assembled(
+    mesh: Mesh,
+    source_vertex: NDArray[np.integer],
+    faces: NDArray[np.integer],
+    chart: NDArray[np.integer],
+    uv: NDArray[np.floating],
+    options: AtlasOptions,
+) -> Atlas:
+    """Atlas whose vertices are copies of the mesh's."""
+    return Atlas(
+        positions=mesh.vertices[source_vertex],
+        faces=faces.astype(np.int32),
+        uv=np.clip(uv, 0.0, 1.0),
+        chart=chart.astype(np.int32),
+        normals=mesh.vertex_normals[source_vertex],
+        height=options.resolution,
+        width=options.resolution,
+    )
