@@ -13,6 +13,10 @@ from reflfield.progress import report
 Array = NDArray[Any]
 SEEDING_DIMENSIONS = 16
 SEEDING_TURNS = 5
+# Seeds tried, on so many points (and one more per cluster), for so many turns each.
+STARTS = 4
+START_POINTS = 8192
+START_TURNS = 10
 # Points whose distances to all clusters are held at once.
 POINTS_AT_ONCE = 8192
 # Iterations stop when the squared error falls by less than this share.
@@ -68,25 +72,39 @@ def cluster_columns(
         Error relative to the points' own size after each iteration; never rises.
     """
     if labels is None:
-        labels = seeded_labels(points[:, :SEEDING_DIMENSIONS], n_clusters, rng)
-    clusters = updated(points, labels, n_clusters, n_components)
+        clusters = best_start(points, n_clusters, n_components, rng)
+        iterations = max(iterations, 1)
+    else:
+        clusters = updated(points, labels, n_clusters, n_components)
+    clusters, errors = alternate(points, clusters, iterations)
     size = max(float((points.astype(np.float64) ** 2).sum()), 1e-300)
-    history: list[float] = []
+    return clusters, tuple(float(np.sqrt(error / size)) for error in errors)
+
+
+def alternate(
+    points: Array, clusters: Clusters, iterations: int
+) -> tuple[Clusters, list[float]]:
+    """Assign points and update clusters in turns; clusters and the squared error of each turn.
+
+    The labels of the clusters that come in need not be those of the points.
+    """
+    n_clusters, _, n_components = clusters.bases.shape
+    errors: list[float] = []
     for iteration in range(iterations):
         report("local PCA", iteration, iterations)
         labels, squared = nearest(points, clusters)
-        history.append(float(np.sqrt(squared.sum() / size)))
+        errors.append(float(squared.sum()))
         labels = without_empty(labels, squared, n_clusters)
-        settled = np.array_equal(labels, clusters.labels) or _settled(history)
+        settled = np.array_equal(labels, clusters.labels) or _settled(errors)
         clusters = updated(points, labels, n_clusters, n_components)
         if settled:
             break
     report("local PCA", iterations, iterations)
-    return clusters, tuple(history)
+    return clusters, errors
 
 
-def _settled(history: list[float]) -> bool:
-    return len(history) > 1 and history[-1] ** 2 > (1 - LEAST_PROGRESS) * history[-2] ** 2
+def _settled(errors: list[float]) -> bool:
+    return len(errors) > 1 and errors[-1] >= (1 - LEAST_PROGRESS) * errors[-2]
 
 
 def nearest(points: Array, clusters: Clusters) -> tuple[NDArray[np.int32], Array]:
@@ -174,6 +192,27 @@ def without_empty(
 
 
 # --- start -------------------------------------------------------------------------------
+
+
+def best_start(
+    points: Array, n_clusters: int, n_components: int, rng: np.random.Generator
+) -> Clusters:
+    """Clusters of a share of the points, the best of several seeds after a few turns."""
+    chosen = np.arange(len(points))
+    if len(points) > START_POINTS + n_clusters:
+        chosen = np.sort(rng.choice(len(points), START_POINTS + n_clusters, replace=False))
+    share = points[chosen]
+    best: Clusters | None = None
+    least = np.inf
+    for _ in range(STARTS if n_components else 1):
+        labels = seeded_labels(share[:, :SEEDING_DIMENSIONS], n_clusters, rng)
+        clusters = updated(share, labels, n_clusters, n_components)
+        clusters, _ = alternate(share, clusters, START_TURNS)
+        error = float(nearest(share, clusters)[1].sum())
+        if best is None or error < least:
+            best, least = clusters, error
+    assert best is not None
+    return best
 
 
 def seeded_labels(

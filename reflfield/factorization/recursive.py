@@ -20,6 +20,8 @@ from reflfield.factorization.sources import Block
 # Directions of the coefficient covariance below this share of the largest are lifted to it,
 # so that its inverse exists when the data have less than full rank.
 COVARIANCE_FLOOR = 1e-9
+# What stands for the variance of data that are all zero; its inverse is still in range.
+LEAST_VARIANCE = 1e-200
 # Rows solved at once; bounds the memory of the unpacked matrices.
 ROWS_AT_ONCE = 4096
 
@@ -130,14 +132,14 @@ def infer(model: Model, block: Block, gram: Array) -> Posterior:
     projected = model.basis.T @ weighted(residual, block.weights, model.n_channels)
     precision = unpack((block.weights.T @ gram).astype(np.float64), model.rank)
     prior = model.noise * np.linalg.pinv(model.prior_covariance, hermitian=True)
-    covariance = model.noise * np.linalg.solve(precision + prior, np.eye(model.rank)[None])
-    step = np.einsum("kij,jk->ki", covariance, projected.astype(np.float64)) / model.noise
+    inverse = np.linalg.solve(precision + prior, np.eye(model.rank)[None])
+    step = np.einsum("kij,jk->ki", inverse, projected.astype(np.float64))
     residual -= model.basis @ step.T.astype(model.basis.dtype)
     return Posterior(
         mean=model.prior_mean + step,
-        covariance=covariance,
+        covariance=model.noise * inverse,
         squared_residual=squared_residual(residual, block.weights, model.n_channels),
-        spread=np.einsum("kij,kij->k", precision, covariance),
+        spread=model.noise * np.einsum("kij,kij->k", precision, inverse),
     )
 
 
@@ -271,7 +273,7 @@ def floored(covariance: Array) -> Array:
     if covariance.size == 0:
         return covariance
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    values = np.maximum(values, COVARIANCE_FLOOR * max(values[-1], 1e-300))
+    values = np.maximum(values, COVARIANCE_FLOOR * max(values[-1], LEAST_VARIANCE))
     return (vectors * values) @ vectors.T
 
 

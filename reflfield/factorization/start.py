@@ -174,7 +174,7 @@ def _first_model(
     filled = weighted(data.values - offset[:, None], data.weights, n_channels)
     if trial > 0:
         # Another beginning on what may be the same block.
-        filled = filled * (0.5 + rng.random(filled.shape[1])).astype(filled.dtype)
+        filled = filled * (0.5 + rng.random((filled.shape[1],))).astype(filled.dtype)
     basis, values = leading_vectors(filled, rank, rng)
     share = max(float(weights.mean()), LEAST_COVERAGE)
     variance = (values.astype(np.float64) / share) ** 2 / filled.shape[1]

@@ -1,0 +1,328 @@
+"""Completion: exact cases, other people's answers, gaps of every shape, extreme numbers."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import zarr
+
+from reflfield.errors import InputError, ShapeError
+from reflfield.factorization import ArraySource, complete
+
+from .problems import problem, unobserved_error
+
+
+def holed(data):
+    return np.where(data.observed, data.measured, np.nan)
+
+
+# --- exact -------------------------------------------------------------------------------
+
+
+def test_rank_one_hole_is_filled():
+    truth = np.outer([1.0, 2.0, 2.0, -1.0], [3.0, 1.0, 4.0, -2.0, 0.5])
+    seen = np.ones(truth.shape, dtype=bool)
+    seen[2, 1] = seen[0, 3] = False
+    fit = complete(np.where(seen, truth, np.nan), rank=1)
+    # The prior pulls by noise / signal, both near rounding here.
+    np.testing.assert_allclose(fit.reconstruct(), truth, atol=1e-4)
+    assert fit.basis.shape == (4, 1)
+    assert fit.coefficients.shape == (5, 1)
+
+
+def test_reconstruct_selects_columns(rng):
+    data = problem("random", rng, n_directions=8, n_columns=40, rank=3)
+    fit = complete(holed(data), rank=3)
+    whole = fit.reconstruct()
+    np.testing.assert_array_equal(
+        fit.reconstruct(slice(3, 7)), fit.reconstruct(np.arange(3, 7))
+    )
+    np.testing.assert_allclose(fit.reconstruct(5), whole[:, 5:6], rtol=1e-5, atol=1e-6)
+
+
+def test_empty_column_becomes_the_mean_and_empty_row_is_zero(rng):
+    data = problem("random", rng, n_directions=12, n_columns=200, rank=3)
+    observed = data.observed.copy()
+    observed[:, 17] = False
+    observed[30] = False
+    # 144 rows: two observed entries are under 2 %, three are above.
+    observed[:, 18] = False
+    observed[:2, 18] = True
+    fit = complete(data.measured, observed, rank=3)
+    assert np.flatnonzero(fit.empty_columns).tolist() == [17]
+    assert np.flatnonzero(fit.sparse_columns).tolist() == [17, 18]
+    assert np.flatnonzero(fit.empty_rows).tolist() == [30]
+    np.testing.assert_array_equal(fit.reconstruct(17)[:, 0], fit.mean)
+    assert np.abs(fit.reconstruct()[30]).max() == 0
+
+
+def test_sparse_columns_leave_the_basis_alone(rng):
+    data = problem("random", rng, n_directions=12, n_columns=200, rank=3)
+    observed = data.observed.copy()
+    observed[:, 100:] = False
+    spoiled = data.measured.copy()
+    spoiled[0, 100:] = 1e6
+    observed[0, 100:] = True
+    fit = complete(spoiled, observed, rank=3)
+    assert fit.noise < 0.02  # planted: 0.01 of unit variance
+    assert fit.sparse_columns[100:].all()
+
+
+# --- truth planted -----------------------------------------------------------------------
+
+
+def test_random_gaps_are_filled_to_the_noise_in_two_passes(rng):
+    data = problem("random", rng)
+    fit = complete(data.measured, data.observed, rank=6, passes=2)
+    # r (m + n - r) parameters from half of m n entries: noise * sqrt(2 r (m + n) / m n).
+    m, n = data.truth.shape
+    bound = 0.01 * np.sqrt(2 * 6 * (m + n) / (m * n))
+    assert unobserved_error(fit.reconstruct(), data) < 1.3 * bound
+    assert fit.noise == pytest.approx(0.01, rel=0.05)
+    assert fit.residuals[-1] < 1.05 * 0.01
+
+
+@pytest.mark.parametrize("pattern", ["hemispheric", "smooth"])
+def test_occlusion_shaped_gaps_beat_brand_tenfold(rng, pattern):
+    data = problem(pattern, rng, horizon=0.0)
+    ours = complete(data.measured, data.observed, rank=6)
+    brand = complete(data.measured, data.observed, rank=6, method="brand", block=64)
+    error = unobserved_error(ours.reconstruct(), data)
+    assert error < 0.02
+    assert error < 0.1 * unobserved_error(brand.reconstruct(), data)
+
+
+def test_basis_is_orthonormal_ordered_and_signed(rng, rounding):
+    data = problem("hemispheric", rng, n_directions=20, n_columns=300)
+    fit = complete(data.measured, data.observed, rank=6)
+    gram = fit.basis.T @ fit.basis
+    assert np.abs(gram - np.eye(6)).max() < rounding(np.float32, 20)
+    assert (fit.basis[np.abs(fit.basis).argmax(axis=0), np.arange(6)] > 0).all()
+    moments = ((fit.coefficients + fit.basis.T @ fit.mean) ** 2).mean(axis=0)
+    # Ordered by posterior moments, which exceed those of the estimates by the noise.
+    assert (np.diff(moments) < 0.05 * moments[:-1]).all()
+
+
+def test_training_residual_never_stalls_over_column_orders(rng):
+    data = problem("smooth", rng, n_directions=24, n_columns=400)
+    errors = []
+    for seed in range(6):
+        fit = complete(data.measured, data.observed, rank=6, seed=seed, block=96)
+        assert fit.residuals[-1] < 0.0105
+        errors.append(unobserved_error(fit.reconstruct(), data, at_least=24))
+    assert max(errors) < 1.2 * min(errors)
+
+
+@pytest.mark.parametrize("block", [50, 128, 600])
+def test_block_size_matters_little(rng, block):
+    data = problem("random", rng, n_directions=20)
+    reference = complete(data.measured, data.observed, rank=6).reconstruct()
+    other = complete(data.measured, data.observed, rank=6, block=block).reconstruct()
+    # Both are within the estimation error of the truth, so of each other.
+    assert np.sqrt(((other - reference) ** 2).mean()) < 0.004
+
+
+def test_same_seed_same_bytes(rng):
+    data = problem("hemispheric", rng, n_directions=16, n_columns=200)
+    fits = [complete(data.measured, data.observed, rank=4, seed=3) for _ in range(2)]
+    np.testing.assert_array_equal(fits[0].basis, fits[1].basis)
+    np.testing.assert_array_equal(fits[0].coefficients, fits[1].coefficients)
+
+
+def test_centred_model_fits_offset_and_basis(rng):
+    data = problem("random", rng, n_directions=16, n_columns=400, rank=2)
+    offset = 5 * rng.standard_normal(256).astype(np.float32)[:, None]
+    fit = complete(data.measured + offset, data.observed, rank=2, centred=True)
+    assert unobserved_error(fit.reconstruct() - offset, data) < 0.003
+    assert fit.basis.shape == (256, 2)
+
+
+# --- weights and channels ----------------------------------------------------------------
+
+
+def test_weights_of_zero_and_one_are_the_observed_flags(rng):
+    data = problem("random", rng, n_directions=12, n_columns=100, rank=3)
+    flagged = complete(data.measured, data.observed, rank=3)
+    weights = data.observed.astype(np.float32)
+    weighted = complete(data.measured, weights=weights, rank=3)
+    np.testing.assert_array_equal(flagged.basis, weighted.basis)
+
+
+def test_low_weights_discount_noisy_entries(rng):
+    data = problem("random", rng, n_directions=16, n_columns=300, rank=3)
+    noisy = rng.random(data.truth.shape) < 0.5
+    measured = data.measured + np.where(noisy, 0.5, 0) * rng.standard_normal(noisy.shape)
+    blind = complete(measured, data.observed, rank=3)
+    weights = data.observed * np.where(noisy, (0.01 / 0.5) ** 2, 1.0)
+    aware = complete(measured, weights=weights, rank=3)
+    assert unobserved_error(aware.reconstruct(), data) < 0.1 * unobserved_error(
+        blind.reconstruct(), data
+    )
+
+
+def test_channels_share_the_pattern(rng):
+    """Three channels with one pattern give what the same pattern repeated gives."""
+    data = problem("random", rng, n_directions=9, n_columns=150, rank=3)
+    three = np.repeat(data.truth, 3, axis=0) * np.tile([1.0, 0.5, 2.0], 81)[:, None]
+    three = three + 0.01 * rng.standard_normal(three.shape)
+    shared = complete(three, data.observed, rank=3, n_channels=3, passes=6)
+    repeated = complete(three, np.repeat(data.observed, 3, axis=0), rank=3, passes=6)
+    np.testing.assert_allclose(shared.reconstruct(), repeated.reconstruct(), atol=0.01)
+    assert shared.empty_rows.shape == (243,)
+
+
+# --- sources -----------------------------------------------------------------------------
+
+
+class TexelMajor:
+    """A store of columns as rows, as the observations are on disk."""
+
+    run_length = 16
+
+    def __init__(self, data):
+        self.values, self.seen = data.measured.T.copy(), data.observed.T.copy()
+        self.shape = data.measured.shape
+
+    def read(self, columns):
+        return self.values[columns].T, self.seen[columns].T
+
+
+def test_every_source_gives_the_same_answer(rng, tmp_path):
+    data = problem("random", rng, n_directions=14, n_columns=220, rank=3)
+    store = zarr.create_array(tmp_path / "m.zarr", shape=data.truth.shape, chunks=(196, 40),
+                              dtype="f4")  # fmt: skip
+    store[:] = holed(data)
+    cuts = [0, 90, 91, 220]
+    blocks = [(data.measured[:, a:b], data.observed[:, a:b]) for a, b in pairwise(cuts)]
+    sources = {
+        "texel major": TexelMajor(data),
+        "zarr": store,
+        "array source": ArraySource(data.measured, data.observed),
+        "blocks": blocks,
+        "stream": lambda: iter(blocks),
+    }
+    reference = complete(data.measured, data.observed, rank=3).reconstruct()
+    for name, source in sources.items():
+        found = complete(source, rank=3, block=64).reconstruct()
+        assert np.sqrt(((found - reference) ** 2).mean()) < 0.004, name
+
+
+def test_unobserved_values_are_never_used(rng):
+    data = problem("random", rng, n_directions=10, n_columns=80, rank=2)
+    rubbish = rng.choice([np.nan, np.inf, -np.inf, 1e38], size=data.truth.shape)
+    spoiled = np.where(data.observed, data.measured, rubbish).astype(np.float32)
+    for method in ("map", "brand"):
+        clean = complete(data.measured, data.observed, rank=2, method=method)
+        dirty = complete(spoiled, data.observed, rank=2, method=method)
+        np.testing.assert_array_equal(clean.basis, dirty.basis)
+
+
+# --- stability ---------------------------------------------------------------------------
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_unit_does_not_matter(rng, scale, dtype):
+    data = problem("random", rng, n_directions=10, n_columns=100, rank=2)
+    measured = data.measured.astype(dtype) * dtype(scale)
+    fit = complete(measured, data.observed, rank=2)
+    assert fit.basis.dtype == dtype
+    found = fit.reconstruct().astype(np.float64) / scale
+    assert unobserved_error(found, data) < 0.01
+    assert fit.noise / scale == pytest.approx(0.01, rel=0.1)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rank_above_the_true_rank_is_harmless(rng, dtype):
+    data = problem("random", rng, n_directions=14, n_columns=200, rank=2, noise=0.0)
+    fit = complete(data.truth.astype(dtype), data.observed, rank=6)
+    # Truth is rounded to float32; directions without data must not blow up the gaps.
+    assert unobserved_error(fit.reconstruct(), data) < 1e-4
+    gram = fit.basis.T @ fit.basis
+    assert np.abs(gram - np.eye(6)).max() < 64 * np.finfo(dtype).eps
+
+
+@pytest.mark.stability
+def test_duplicate_zero_and_single_columns(rng):
+    column = rng.standard_normal((50, 1))
+    same = np.repeat(column, 30, axis=1)
+    seen = rng.random(same.shape) < 0.7
+    fit = complete(same, seen, rank=3)
+    np.testing.assert_allclose(fit.reconstruct(), same, atol=1e-3)
+    assert np.abs(complete(np.zeros((20, 10)), rank=2).reconstruct()).max() == 0
+    one = complete(column, rank=5)
+    assert one.rank == 1
+    np.testing.assert_allclose(one.reconstruct(), column, atol=1e-4)
+
+
+@pytest.mark.stability
+def test_single_row():
+    row = np.array([[1.0, 2.0, np.nan, 4.0]])
+    fit = complete(row, rank=3)
+    assert fit.rank == 1
+    found = fit.reconstruct()
+    # One row cannot tell signal from noise: right to within the noise that is reported.
+    assert np.nanmax(np.abs(found - row)) < 2 * fit.noise
+    assert fit.empty_columns.tolist() == [False, False, True, False]
+
+
+@pytest.mark.stability
+def test_condition_1e12_keeps_the_large_directions(rng):
+    left = np.linalg.qr(rng.standard_normal((80, 3)))[0]
+    truth = (left * [1.0, 1e-6, 1e-12]) @ rng.standard_normal((3, 200))
+    seen = rng.random(truth.shape) < 0.6
+    found = complete(truth, seen, rank=3, passes=8).reconstruct()
+    assert np.abs(found - truth).max() < 1e-5 * np.abs(truth).max()
+
+
+@pytest.mark.stability
+def test_error_grows_gently_as_less_is_observed(rng):
+    data = problem("random", rng, n_directions=28, n_columns=600, rank=4)
+    shares = np.array([1.0, 0.6, 0.35, 0.2, 0.1])
+    draw = rng.random(data.truth.shape)
+    errors = []
+    for share in shares:
+        fit = complete(data.measured, draw < share, rank=4)
+        errors.append(np.sqrt(((fit.reconstruct() - data.truth) ** 2).mean()))
+    # Least squares: error ~ 1 / sqrt(share); a slope of -1 leaves room for the few-entry end.
+    slope = np.polyfit(np.log(shares), np.log(errors), 1)[0]
+    assert -1.0 < slope < -0.4
+
+
+# --- refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"rank": 0}, "rank: expected at least 1"),
+        ({"passes": 0}, "passes: expected at least 1"),
+        ({"block": 0}, "block: expected at least 1"),
+        ({"method": "als"}, "method: expected 'map' or 'brand'"),
+        ({"n_channels": 2}, "n_channels: expected a divisor of 3 rows"),
+        ({"observed": np.ones((4, 3), bool)}, r"observed: expected shape \(3, 4\)"),
+        ({"weights": np.full((3, 4), 1.5)}, r"weights: expected values in \[0, 1\]"),
+        ({"weights": np.ones((3, 4)), "observed": np.ones((3, 4), bool)}, "received both"),
+        ({"observed": np.zeros((3, 4), bool)}, "observed: expected a column of which"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        complete(np.ones((3, 4)), **({"rank": 1} | arguments))
+
+
+def test_bad_matrices_are_refused():
+    with pytest.raises(ShapeError, match=r"matrix: expected shape \(n_rows, n_columns\)"):
+        complete(np.ones(3), rank=1)
+    with pytest.raises(ShapeError, match="at least one row and column"):
+        complete(np.ones((3, 0)), rank=1)
+    with pytest.raises(InputError, match="finite values where observed, received inf in row 1"):
+        complete(np.array([[1.0, 2.0], [3.0, np.inf]]), rank=1)
+    with pytest.raises(ShapeError, match=r"expected blocks of shape \(3, k\)"):
+        complete([np.ones((3, 2)), np.ones((4, 2))], rank=1)
+    with pytest.raises(InputError, match="expected None with a source or blocks"):
+        complete([np.ones((3, 2))], np.ones((3, 2), bool), rank=1)
+    with pytest.raises(InputError, match="at least one block of columns"):
+        complete([], rank=1)
