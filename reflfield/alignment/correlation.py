@@ -29,7 +29,6 @@ from scipy.spatial.transform import Rotation
 from reflfield.errors import InputError
 from reflfield.sphere.coupling import Coupled
 from reflfield.sphere.wigner import (
-    ROW_MARGIN,
     block_offsets,
     euler_from_matrix,
     fill_phases,
@@ -174,13 +173,13 @@ def _complex_spectrum(
     im: NDArray[np.floating],
 ) -> None:
     """Rows m >= 0 of the complex series of a real one, those of m > 0 doubled."""
-    offset = 0
+    offset, width = 0, row_start[1]
     root = series.dtype.type(np.sqrt(0.5))
     for j in range(row_start.shape[0] - 1):
         size = 2 * j + 1
         block = series[offset : offset + size * size].reshape(size, size)
         for m in range(j + 1):
-            row = row_start[j] + m * (size + 2 * ROW_MARGIN) + ROW_MARGIN + j
+            row = row_start[j] + m * width + width // 2
             lead = 1 if m % 2 == 0 else -1
             if m == 0:
                 re[row] = block[j, j]
@@ -206,24 +205,42 @@ def _complex_spectrum(
 def _turn_series(
     re: NDArray[np.floating],
     im: NDArray[np.floating],
-    left: NDArray[np.floating],
-    right: NDArray[np.floating],
+    phases: NDArray[np.floating],
     row_start: NDArray[np.int64],
     q_re: NDArray[np.floating],
     q_im: NDArray[np.floating],
 ) -> None:
-    """Series times exp(-i (m alpha + n gamma)); `right` holds orders -J .. J."""
-    centre = row_start.shape[0] - 2
+    """Series times exp(-i (m alpha + n gamma)), the phases of all (m, n)."""
     for j in range(row_start.shape[0] - 1):
-        width = 2 * j + 1 + 2 * ROW_MARGIN
-        for m in range(j + 1):
-            row = row_start[j] + m * width + ROW_MARGIN
-            c, s = left[0, m], left[1, m]
-            for k in range(2 * j + 1):
-                a, b = right[0, centre - j + k], right[1, centre - j + k]
-                e_re, e_im = c * a - s * b, -(s * a + c * b)
-                q_re[row + k] = re[row + k] * e_re - im[row + k] * e_im
-                q_im[row + k] = re[row + k] * e_im + im[row + k] * e_re
+        first, last = row_start[j], row_start[j + 1]
+        a, b = re[first:last], im[first:last]
+        c, s = phases[0, : last - first], phases[1, : last - first]
+        out_re, out_im = q_re[first:last], q_im[first:last]
+        for k in range(a.shape[0]):
+            out_re[k] = a[k] * c[k] + b[k] * s[k]
+            out_im[k] = b[k] * c[k] - a[k] * s[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_plane(
+    alpha: float,
+    gamma: float,
+    left: NDArray[np.floating],
+    right: NDArray[np.floating],
+    phases: NDArray[np.floating],
+) -> None:
+    """cos and sin of m alpha + n gamma for all m >= 0 and n, rows as in `DegreeTables`."""
+    width = right.shape[1]
+    fill_phases(alpha, 0, left)
+    fill_phases(gamma, width // 2, right)
+    for m in range(left.shape[1]):
+        c, s = left[0, m], left[1, m]
+        a, b = right[0], right[1]
+        cosine = phases[0, m * width : (m + 1) * width]
+        sine = phases[1, m * width : (m + 1) * width]
+        for k in range(width):
+            cosine[k] = c * a[k] - s * b[k]
+            sine[k] = s * a[k] + c * b[k]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -239,16 +256,21 @@ def _sum_derivatives(
     one = d.dtype.type(1.0)
     value, gx, gy, gz, zz = zero, zero, zero, zero, zero
     plus, minus, xy, xz, yz = zero, zero, zero, zero, zero
-    order, up, down, up2, down2, rest = ladder
-    for k in range(ROW_MARGIN, d.shape[0] - ROW_MARGIN):
-        re, im, n = q_re[k], q_im[k], order[k]
-        u, v = up[k] * d[k + 1], down[k] * d[k - 1]
-        p, q = up2[k] * d[k + 2], down2[k] * d[k - 2]
-        here = re * d[k]
+    # Shifted slices: no index can be negative, so the loop becomes vector instructions.
+    n_entries = d.shape[0] - 4
+    order, up, down = ladder[0, 2:], ladder[1, 2:], ladder[2, 2:]
+    up2, down2, rest = ladder[3, 2:], ladder[4, 2:], ladder[5, 2:]
+    d0, above, below, above2 = d[2:], d[3:], d[1:], d[4:]
+    re_part, im_part = q_re[2:], q_im[2:]
+    for k in range(n_entries):
+        re, im, n = re_part[k], im_part[k], order[k]
+        u, v = up[k] * above[k], down[k] * below[k]
+        p, q = up2[k] * above2[k], down2[k] * d[k]
+        here = re * d0[k]
         value += here
         zz += here * n * n
         plus += here * rest[k]
-        gz += im * n * d[k]
+        gz += im * n * d0[k]
         gx += im * (u + v)
         gy += re * (u - v)
         minus += re * (p + q)
@@ -335,12 +357,13 @@ def climb(
     Steps that would bring ``R[2, 2]`` below `lowest_z` are cut.
     """
     n_entries = row_start[-1]
-    n_degrees = row_start.shape[0] - 1
+    n_degrees, width = row_start.shape[0] - 1, row_start[1]
     like = series.dtype
     re, im = np.zeros(n_entries, like), np.zeros(n_entries, like)
     q_re, q_im = np.zeros(n_entries, like), np.zeros(n_entries, like)
     d = np.zeros(n_entries, like)
-    left, right = np.zeros((2, n_degrees), like), np.zeros((2, 2 * n_degrees - 1), like)
+    left, right = np.zeros((2, n_degrees), like), np.zeros((2, width), like)
+    phases = np.zeros((2, n_degrees * width), like)
     f, trial, step = np.zeros(10), np.zeros((3, 3)), np.zeros(3)
     for i in range(rows.shape[0]):
         if i == 0 or rows[i] != rows[i - 1]:
@@ -352,9 +375,8 @@ def climb(
         for _ in range(n_steps + 1):
             alpha, beta, gamma = euler_from_matrix(trial)
             fill_wigner_d(beta, row_start, recursion, edge, d)
-            fill_phases(alpha, 0, left)
-            fill_phases(gamma, n_degrees - 1, right)
-            _turn_series(re, im, left, right, row_start, q_re, q_im)
+            _fill_plane(alpha, gamma, left, right, phases)
+            _turn_series(re, im, phases, row_start, q_re, q_im)
             _sum_derivatives(q_re, q_im, d, ladder, f)
             if f[0] > found[i, 0]:
                 if length > 0.9 * radius:

@@ -126,8 +126,9 @@ class DegreeTables:
     """Constants of the recursion for degrees 0 .. `degree_limit` - 1, flat by rows.
 
     Only rows m >= 0 are kept: those of negative order follow by symmetry. The
-    row of (j, m) begins at ``row_start[j] + m * width`` with
-    ``width = 2 * j + 1 + 2 * ROW_MARGIN`` and holds orders -j .. j inside zero margins.
+    row of (j, m) begins at ``row_start[j] + m * width``, and order n stands ``width // 2 + n``
+    farther, for all degrees alike: so loops run over whole degrees. What no order
+    -j .. j fills is zero.
 
     Parameters
     ----------
@@ -137,8 +138,8 @@ class DegreeTables:
         First entry of each degree.
     recursion : (3, n) float
         d^j = (recursion[0] * cos(beta) - recursion[1]) d^{j-1} - recursion[2] d^{j-2}.
-    edge : (degree_limit, 2 * degree_limit - 1) float
-        Factors of the last row, per degree and order, centred.
+    edge : (degree_limit, width) float
+        Factors of the last row of each degree.
     ladder : (6, n) float
         Order n; c+; c-; c+ c+; c- c-; j (j + 1) - n^2, the matrix elements of
         the generators that the derivatives need.
@@ -158,46 +159,58 @@ def degree_tables(degree_limit: int, dtype: str = "float32") -> DegreeTables:
     Examples
     --------
     >>> degree_tables(3).row_start
-    array([ 0,  5, 19, 46])
+    array([ 0,  9, 27, 54])
     """
-    degrees = np.arange(degree_limit, dtype=np.int64)
-    sizes = (degrees + 1) * (2 * degrees + 1 + 2 * ROW_MARGIN)
-    start = np.concatenate([[0], np.cumsum(sizes)])
+    degrees = np.arange(degree_limit + 1, dtype=np.int64)
+    width = row_width(degree_limit)
+    start = width * (degrees * (degrees + 1) // 2)
     recursion = np.zeros((3, start[-1]))
     ladder = np.zeros((6, start[-1]))
-    edge = np.zeros((degree_limit, 2 * degree_limit - 1))
+    edge = np.zeros((degree_limit, width))
     for j in range(degree_limit):
         part = slice(start[j], start[j + 1])
-        recursion[:, part] = _recursion_of_degree(j).reshape(3, -1)
-        ladder[:, part] = _ladder_of_degree(j).reshape(6, -1)
+        recursion[:, part] = _recursion_of_degree(j, width).reshape(3, -1)
+        ladder[:, part] = _ladder_of_degree(j, width).reshape(6, -1)
         n = np.arange(-j + 1, j)
         growth = np.sqrt(2.0 * j * (2.0 * j - 1.0) / ((j + n) * (j - n)))
-        edge[j, n + degree_limit - 1] = growth
+        edge[j, n + width // 2] = growth
     return DegreeTables(
         degree_limit, start, recursion.astype(dtype), edge.astype(dtype), ladder.astype(dtype)
     )
 
 
-def _recursion_of_degree(j: int) -> NDArray[np.float64]:
+def row_width(degree_limit: int) -> int:
+    """Entries of one row of `DegreeTables`.
+
+    Examples
+    --------
+    >>> row_width(3)
+    9
+    """
+    return 2 * degree_limit - 1 + 2 * ROW_MARGIN
+
+
+def _recursion_of_degree(j: int, width: int) -> NDArray[np.float64]:
     """(3, j + 1, width) factors that give degree j from j - 1 and j - 2."""
-    out = np.zeros((3, j + 1, 2 * j + 1 + 2 * ROW_MARGIN))
+    out = np.zeros((3, j + 1, width))
     i = j - 1
     if j == 0:
         return out
     m = np.arange(j, dtype=np.float64)[:, None]
     n = np.arange(-i, i + 1, dtype=np.float64)[None, :]
-    columns = slice(ROW_MARGIN + 1, ROW_MARGIN + 2 * j)
+    columns = slice(width // 2 - i, width // 2 + j)
     if i == 0:
         out[0, 0, columns] = 1.0
         return out
     below = i * np.sqrt((j**2 - m**2) * (j**2 - n**2))
+    last = np.maximum(i**2 - m**2, 0.0) * np.maximum(i**2 - n**2, 0.0)
     out[0, :j, columns] = (2 * i + 1) * i * j / below
     out[1, :j, columns] = (2 * i + 1) * m * n / below
-    out[2, :j, columns] = j * np.sqrt((i**2 - m**2) * (i**2 - n**2)) / below
+    out[2, :j, columns] = j * np.sqrt(last) / below
     return out
 
 
-def _ladder_of_degree(j: int) -> NDArray[np.float64]:
+def _ladder_of_degree(j: int, width: int) -> NDArray[np.float64]:
     """(6, j + 1, width) generator elements of degree j, the same for every row."""
     n = np.arange(-j, j + 1, dtype=np.float64)
     up = np.sqrt((j - n) * (j + n + 1))
@@ -205,9 +218,24 @@ def _ladder_of_degree(j: int) -> NDArray[np.float64]:
     up2 = up * np.sqrt(np.maximum((j - n - 1) * (j + n + 2), 0.0))
     down2 = down * np.sqrt(np.maximum((j + n - 1) * (j - n + 2), 0.0))
     rows = np.stack([n, up, down, up2, down2, j * (j + 1) - n**2])
-    out = np.zeros((6, j + 1, 2 * j + 1 + 2 * ROW_MARGIN))
-    out[:, :, ROW_MARGIN : ROW_MARGIN + 2 * j + 1] = rows[:, None, :]
+    out = np.zeros((6, j + 1, width))
+    out[:, :, width // 2 - j : width // 2 + j + 1] = rows[:, None, :]
     return out
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _recur(
+    a: NDArray[np.floating],
+    b: NDArray[np.floating],
+    c: NDArray[np.floating],
+    cosine: float,
+    newer: NDArray[np.floating],
+    older: NDArray[np.floating],
+    out: NDArray[np.floating],
+) -> None:
+    """Degree j from j - 1 and j - 2; c is 0 where the latter has no entry."""
+    for k in range(out.shape[0]):
+        out[k] = (a[k] * cosine - b[k]) * newer[k] - c[k] * older[k]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -218,45 +246,45 @@ def fill_wigner_d(
     edge: NDArray[np.floating],
     d: NDArray[np.floating],
 ) -> None:
-    """All d^j_{mn}(beta), m >= 0, into the flat rows of `DegreeTables`."""
-    degree_limit = row_start.shape[0] - 1
+    """All d^j_{mn}(beta), m >= 0, into the flat rows of `DegreeTables`; d is zero at first."""
+    width = edge.shape[1]
+    centre = width // 2
     one = d.dtype.type(1.0)
     cosine = d.dtype.type(np.cos(beta))
     half_sine = d.dtype.type(-0.5 * np.sin(beta))
     cosine2 = d.dtype.type(np.cos(0.5 * beta) ** 2)
     sine2 = d.dtype.type(np.sin(0.5 * beta) ** 2)
     top, bottom = one, one
-    d[ROW_MARGIN] = one
-    for j in range(1, degree_limit):
-        width = 2 * j + 1 + 2 * ROW_MARGIN
-        start, before = row_start[j], row_start[j - 1]
+    d[centre] = one
+    for j in range(1, row_start.shape[0] - 1):
+        start, before, size = row_start[j], row_start[j - 1], j * width
+        # Rows m < j, orders |n| < j. Slices let the compiler see that no index is
+        # negative, and so use vector instructions.
         twice = row_start[j - 2] if j > 1 else 0
-        # Rows m < j, orders |n| < j: recursion over the degree.
-        for m in range(j):
-            row = start + m * width + ROW_MARGIN + 1
-            row1 = before + m * (width - 2) + ROW_MARGIN
-            for k in range(2 * j - 1):
-                d[row + k] = (recursion[0, row + k] * cosine - recursion[1, row + k]) * d[
-                    row1 + k
-                ]
-            if m < j - 1:
-                row2 = twice + m * (width - 4) + ROW_MARGIN
-                for k in range(2 * j - 3):
-                    d[row + 1 + k] -= recursion[2, row + 1 + k] * d[row2 + k]
+        _recur(
+            recursion[0, start : start + size],
+            recursion[1, start : start + size],
+            recursion[2, start : start + size],
+            cosine,
+            d[before : before + size],
+            d[twice : twice + size],
+            d[start : start + size],
+        )
         # Row m = j, then the columns n = -j and j of the others by symmetry.
         top *= cosine2
         bottom *= sine2
-        row = start + j * width + ROW_MARGIN
-        row1 = before + (j - 1) * (width - 2) + ROW_MARGIN
-        d[row] = bottom
-        d[row + 2 * j] = top
-        for k in range(2 * j - 1):
-            d[row + 1 + k] = d[row1 + k] * edge[j, k + degree_limit - j] * half_sine
+        row = d[start + size : start + size + width]
+        last = d[before + size - width : before + size]
+        for k in range(width):
+            row[k] = last[k] * edge[j, k] * half_sine
+        row[centre - j] = bottom
+        row[centre + j] = top
+        sign = one if j % 2 == 0 else -one
+        columns = d[start : start + size].reshape(j, width)
         for m in range(j):
-            other = start + m * width + ROW_MARGIN
-            value = d[row + j + m]
-            d[other + 2 * j] = value if (j - m) % 2 == 0 else -value
-            d[other] = d[row + j - m]
+            columns[m, centre + j] = sign * row[centre + m]
+            columns[m, centre - j] = row[centre - m]
+            sign = -sign
 
 
 @numba.njit(cache=True, nogil=True)
@@ -289,12 +317,12 @@ def _real_block(
     out: NDArray[np.floating],
 ) -> None:
     """Real (2j+1, 2j+1) matrix from the rows m >= 0 of d^j and the phases of alpha, gamma."""
-    root = np.sqrt(0.5)
+    root, centre = np.sqrt(0.5), rows.shape[1] // 2
     for m in range(j + 1):
         row_scale = (1.0 if m % 2 == 0 else -1.0) * (1.0 if m > 0 else root)
         for n in range(j + 1):
-            plus = rows[m, ROW_MARGIN + j + n] * (1.0 if n % 2 == 0 else -1.0)
-            minus = rows[m, ROW_MARGIN + j - n]
+            plus = rows[m, centre + n] * (1.0 if n % 2 == 0 else -1.0)
+            minus = rows[m, centre - n]
             scale = row_scale * (1.0 if n > 0 else root)
             even, odd = scale * (plus + minus), scale * (plus - minus)
             out[j + m, j + n] = even * left[0, m] * right[0, n] - odd * left[1, m] * right[1, n]
@@ -331,7 +359,7 @@ def _real_blocks(
         offset = 0
         for j in range(row_start.shape[0] - 1):
             size = 2 * j + 1
-            rows = d[row_start[j] : row_start[j + 1]].reshape(j + 1, size + 2 * ROW_MARGIN)
+            rows = d[row_start[j] : row_start[j + 1]].reshape(j + 1, edge.shape[1])
             block = out[i, offset : offset + size * size].reshape(size, size)
             _real_block(j, left, right, rows, block)
             offset += size * size
