@@ -114,9 +114,9 @@ def _console() -> Console:
 
 
 def main() -> None:
-    """Run the command; scenes that cannot be simulated end with status 2."""
+    """Run the command; scenes and files that cannot be used end with status 2."""
     try:
         app()
-    except SceneError as error:
+    except (SceneError, OSError) as error:
         print(f"capture-sim: {error}", file=sys.stderr)
         sys.exit(2)

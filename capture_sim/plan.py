@@ -136,13 +136,14 @@ def plan(scene: Scene) -> Plan:
         n_lit=int(points * n_lights * trial.lit_fraction),
     )
     frames = work.n_photographs + scene.heldout_frames
-    abrdf_bytes = 4 * scene.truth.points * work.n_photographs  # deflated to a third
+    fixed_bytes = 4 * scene.truth.points * work.n_photographs  # samples, deflated to a third
+    fixed_bytes += 32 * len(scene.mesh.vertices) + 13 * len(scene.mesh.faces)  # the mesh
     return Plan(
         scene=scene.name,
         work=work,
         effects=tuple(_decided(effect, scene, work) for effect in EFFECTS),
         seconds=n_views * trial.view_seconds + frames * trial.photograph_seconds,
-        bytes=int(n_views * trial.view_bytes + frames * trial.photograph_bytes) + abrdf_bytes,
+        bytes=int(n_views * trial.view_bytes + frames * trial.photograph_bytes) + fixed_bytes,
     )
 
 

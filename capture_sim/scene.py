@@ -38,7 +38,7 @@ A scene file holds the tables below; only `object`, `material`, `cameras` and
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -373,8 +373,3 @@ def _truth_options(table: Table) -> TruthOptions:
     )
     reader.finish()
     return options
-
-
-def names_of(items: Sequence[Table]) -> tuple[str, ...]:
-    """Ids of cameras or lights, in their order."""
-    return tuple(str(item["id"]) for item in items)

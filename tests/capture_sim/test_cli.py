@@ -88,3 +88,10 @@ def test_unknown_scene_lists_the_known(run):
     status, _, err = run("plan", "no_such_scene")
     assert status == 2
     assert "demo_vase" in err
+
+
+def test_places_that_cannot_be_written_end_with_status_2(run, tiny):
+    status, _, err = run("render", tiny, "-o", tiny / "inside_a_file")
+    assert status == 2
+    assert "tiny.toml" in err
+    assert "Traceback" not in err
