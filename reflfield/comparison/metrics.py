@@ -14,23 +14,18 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import flip_evaluator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion
+from skimage.metrics import structural_similarity
 
 from reflfield.comparison.tonemapping import display, luminance
 from reflfield.errors import InputError, ShapeError
-
-with warnings.catch_warnings():
-    # The package still imports a distutils-era helper on some Pythons.
-    warnings.simplefilter("ignore", DeprecationWarning)
-    import flip_evaluator
-    from skimage.metrics import structural_similarity
 
 Image = NDArray[np.float64]
 

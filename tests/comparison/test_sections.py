@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from reflfield.comparison import plots, sections
-from reflfield.comparison.metrics import compare_frames
+from reflfield.comparison.metrics import FramePair, compare_frames
 from reflfield.comparison.report import Figure, ReportContent, Table, render_report
+from reflfield.errors import InputError
 
 
 def tables(section):
@@ -25,6 +26,21 @@ def test_rows_run_from_worst_to_best_and_skip_the_rest(rng, samples):
         *(f"heldout_00{i}" for i in range(6, -1, -1)),
     ]
     assert table.rows[0][1] == f"{comparison.mean['psnr_ldr']:.2f}"
+
+
+def test_frames_of_one_name_stay_apart_and_others_are_refused(rng, samples):
+    pairs = samples.frame_pairs(rng, count=2, size=24)
+    same = [FramePair("0001", p.photograph, p.relit, p.silhouette) for p in pairs]
+    comparison = compare_frames(same)
+    figures = [
+        i for i in sections.frames_section(comparison, same).items if isinstance(i, Figure)
+    ]
+    # Worst first: the second frame has twice the noise.
+    for figure, metrics in zip(figures, comparison.frames[::-1], strict=False):
+        assert figure.title == "0001"
+        assert f"PSNR {metrics.psnr_ldr:.2f} dB" in figure.caption
+    with pytest.raises(InputError, match=r"pairs: expected frame '0001'.*'heldout_000'"):
+        sections.frames_section(comparison, pairs)
 
 
 def test_silhouette_agreement_is_counted():

@@ -34,10 +34,13 @@ from reflfield.comparison.report import (
     format_bytes,
 )
 from reflfield.comparison.tonemapping import display
+from reflfield.errors import InputError
 
 ROW_PX = 480
 # FLIP errors of good results lie near 0; full scale would show black pictures.
 FLIP_SCALES = (0.1, 0.2, 0.3, 0.5, 1.0)
+# A distribution of fewer says less than their table.
+FRAMES_FOR_PLOTS = 6
 FLIP_LABEL = "FLIP error, all rows: 0 is not distinguishable"
 METRIC_HEADER = ("PSNR LDR, dB", "PSNR HDR, dB", "SSIM", "FLIP")
 
@@ -57,7 +60,7 @@ def frames_section(
     comparison : Comparison
         Of the same frames.
     pairs : iterable of FramePair
-        Read once, one at a time; frames that are not shown are skipped.
+        In the order of the comparison; read once, one at a time.
     title, intro : str
     max_rows : int
         Rows shown, from the worst frame to the best in even steps.
@@ -65,18 +68,25 @@ def frames_section(
     Returns
     -------
     Section
+
+    Raises
+    ------
+    InputError
+        If the frames are not those of the comparison.
     """
-    shown = {f.name: f for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
+    shown = {id(f) for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
     rows = [
-        _compared(pair, shown[pair.name], comparison.exposure)
-        for pair in pairs
-        if pair.name in shown
+        _compared(pair, metrics, comparison.exposure)
+        for pair, metrics in zip(pairs, comparison.frames, strict=True)
+        if id(metrics) in shown
     ]
     rows.sort(key=lambda row: (-row.metrics.flip, row.metrics.name))
     high = _flip_scale([row.error for row in rows])
     items: list[Item] = [_notes_on(comparison)]
     items += [_row_figure(row, high, has_bar=i == 0) for i, row in enumerate(rows)]
-    items += [_distribution(comparison), metrics_table(comparison)]
+    if len(comparison.frames) >= FRAMES_FOR_PLOTS:
+        items.append(_distribution(comparison))
+    items.append(metrics_table(comparison))
     return Section(title, intro, tuple(items))
 
 
@@ -89,6 +99,11 @@ class _Row:
 
 
 def _compared(pair: FramePair, metrics: FrameMetrics, exposure: float) -> _Row:
+    if pair.name != metrics.name:
+        raise InputError(
+            f"pairs: expected frame {metrics.name!r} as in the comparison, received "
+            f"{pair.name!r}; pass the frames that were compared, in the same order"
+        )
     box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
     photograph, relit = (
         encode_picture(pictures.fitted(pictures.tonemapped(image[box], exposure), ROW_PX))
