@@ -1,0 +1,171 @@
+"""The base mesh with its texture as one binary glTF 2.0 file."""
+
+from __future__ import annotations
+
+import json
+import struct
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from reflfield.checks import check_shape
+from reflfield.errors import InputError
+from reflfield.geometry.atlas import Atlas
+from reflfield.geometry.mesh import unit_or_zero, write_atomically
+from reflfield.geometry.texels import frames, texture_axes
+
+_FLOAT, _UINT = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963  # targets of buffer views: what a GPU binds them as
+
+
+def write_glb(
+    path: Path | str, atlas: Atlas, base_colour: NDArray[np.uint8], name: str = "reflfield"
+) -> None:
+    """Write mesh, normals, tangents, texture coordinates and base colour.
+
+    Opens in any glTF viewer. Texture coordinates are turned to glTF's convention
+    (v downwards); tangents run along u, their fourth component is -1 in mirrored charts.
+
+    Parameters
+    ----------
+    path : Path or str
+        Appears only when complete.
+    atlas : Atlas
+    base_colour : (height, width, 3) uint8
+        sRGB encoded, row 0 at v = 1; any size.
+    name : str
+        Name of the node and mesh.
+
+    Raises
+    ------
+    InputError
+        If the texture is not an 8-bit RGB image.
+
+    References
+    ----------
+    Khronos Group, "glTF 2.0 Specification", sections 3.7 and 4.
+    """
+    check_shape("base_colour", base_colour, (None, None, 3))
+    if base_colour.dtype != np.uint8:
+        raise InputError(
+            f"base_colour: expected sRGB-encoded uint8, received {base_colour.dtype}; encode it"
+        )
+    buffer = _Buffer()
+    attributes = {
+        "POSITION": buffer.add(atlas.positions.astype("<f4"), "VEC3", bounds=True),
+        "NORMAL": buffer.add(unit_or_zero(atlas.normals).astype("<f4"), "VEC3"),
+        "TANGENT": buffer.add(vertex_tangents(atlas).astype("<f4"), "VEC4"),
+        "TEXCOORD_0": buffer.add((atlas.uv * [1.0, -1.0] + [0.0, 1.0]).astype("<f4"), "VEC2"),
+    }
+    indices = buffer.add(atlas.faces.astype("<u4").ravel(), "SCALAR", target=_INDICES)
+    image = buffer.add_bytes(_png(base_colour))
+    document = _document(name, attributes, indices, image) | buffer.description()
+    write_atomically(path, _glb(document, bytes(buffer.content)))
+
+
+def vertex_tangents(atlas: Atlas) -> NDArray[np.float64]:
+    """Unit tangents along u and their handedness, (n, 4).
+
+    The bitangent of glTF, ``cross(normal, tangent) * w``, then runs up the texture.
+    """
+    u_axis, _ = texture_axes(atlas)
+    weighted = unit_or_zero(u_axis) * atlas.mesh.face_areas[:, None]
+    total = np.zeros_like(atlas.positions)
+    for corner in range(3):
+        np.add.at(total, atlas.faces[:, corner], weighted)
+    tangents = frames(unit_or_zero(atlas.normals), total)[:, 0]
+    handedness = np.ones(len(tangents))
+    handedness[atlas.faces[atlas.mirrored[atlas.chart]]] = -1.0
+    return np.column_stack([tangents, handedness])
+
+
+class _Buffer:
+    """Binary chunk under construction, with its views and accessors."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self._views: list[dict[str, int]] = []
+        self._accessors: list[dict[str, object]] = []
+
+    def add(
+        self,
+        array: NDArray[np.generic],
+        kind: str,
+        *,
+        target: int = _VERTICES,
+        bounds: bool = False,
+    ) -> int:
+        """Append an array; returns the number of its accessor."""
+        accessor: dict[str, object] = {
+            "bufferView": self.add_bytes(array.tobytes(), target),
+            "componentType": _UINT if array.dtype.kind == "u" else _FLOAT,
+            "count": len(array),
+            "type": kind,
+        }
+        if bounds:
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def add_bytes(self, content: bytes, target: int | None = None) -> int:
+        """Append bytes, aligned to four; returns the number of their view."""
+        view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": len(content)}
+        if target is not None:
+            view["target"] = target
+        self._views.append(view)
+        self.content += content + b"\0" * (-len(content) % 4)
+        return len(self._views) - 1
+
+    def description(self) -> dict[str, object]:
+        """Parts of the glTF document that describe the binary chunk."""
+        return {
+            "buffers": [{"byteLength": len(self.content)}],
+            "bufferViews": self._views,
+            "accessors": self._accessors,
+        }
+
+
+def _document(
+    name: str, attributes: dict[str, int], indices: int, image: int
+) -> dict[str, object]:
+    """Scene with one mesh and one rough dielectric material."""
+    material = {
+        "name": "mean of all photographs",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicFactor": 0.0,
+            "roughnessFactor": 0.8,
+        },
+    }
+    primitive = {"attributes": attributes, "indices": indices, "material": 0, "mode": 4}
+    return {
+        "asset": {"version": "2.0", "generator": "reflfield"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": name, "mesh": 0}],
+        "meshes": [{"name": name, "primitives": [primitive]}],
+        "materials": [material],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [
+            {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+        ],  # linear, trilinear, clamped
+        "images": [{"bufferView": image, "mimeType": "image/png"}],
+    }
+
+
+def _png(pixels: NDArray[np.uint8]) -> bytes:
+    stream = BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
+    return stream.getvalue()
+
+
+def _glb(document: dict[str, object], binary: bytes) -> bytes:
+    """Container of the two chunks, JSON (padded with spaces) and BIN."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
