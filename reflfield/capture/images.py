@@ -102,8 +102,19 @@ def read_encoded(path: Path | str) -> Float32:
         _check_size(path, *picture.size)
         if _bits(path, picture) <= 8:
             return np.asarray(_eight_bit(picture), dtype=np.float32) / np.float32(255)
-        picture.load()  # raises on a truncated file, which OpenCV would fill with grey
+        picture.load()  # raises on a truncated file, which OpenCV before 5 fills with grey
         return _sixteen_bit(path)
+
+
+def read_exposure(path: Path | str) -> Float32:
+    """Read one of several bracketed exposures: sRGB-encoded RGB, (h, w, 3) in [0, 1].
+
+    An EXR is taken as linear up to the sensor's saturation at 1, and encoded.
+    """
+    path = Path(path)
+    if _is_exr(path):
+        return encode_srgb(read_image(path)).astype(np.float32)
+    return _three_channels(read_encoded(path))
 
 
 def read_coverage(path: Path | str) -> Float32:
@@ -393,9 +404,12 @@ def _sixteen_bit(path: Path) -> Float32:
 
 def _decoded(path: Path) -> Float32:
     """Linear RGB of an 8- or 16-bit file."""
-    encoded = read_encoded(path)
-    color = encoded[..., :3] if encoded.shape[2] >= 3 else encoded[..., :1].repeat(3, axis=2)
-    return decode_srgb(color).astype(np.float32)
+    return decode_srgb(_three_channels(read_encoded(path))).astype(np.float32)
+
+
+def _three_channels(encoded: Float32) -> Float32:
+    """RGB without alpha; grey is repeated."""
+    return encoded[..., :3] if encoded.shape[2] >= 3 else encoded[..., :1].repeat(3, axis=2)
 
 
 def _exr_rgb(path: Path) -> Float32:

@@ -17,7 +17,7 @@ from reflfield.capture.images import (
     image_size,
     merge_exposures,
     read_coverage,
-    read_encoded,
+    read_exposure,
     read_image,
 )
 from reflfield.capture.lights import UNKNOWN, Light
@@ -26,6 +26,9 @@ from reflfield.errors import CaptureError
 
 HULL = "hull"
 PLANE = "plane"
+# Lights beyond these add nothing to the mean that a silhouette is made from.
+SILHOUETTE_SAMPLE = 32
+
 DIGEST_PARTS = ("cameras", "lights", "silhouettes", "photographs")
 
 
@@ -65,7 +68,7 @@ class Photograph:
         """Linear radiance, (h, w, 3) float32; bracketed exposures are merged."""
         if len(self.exposures) == 1:
             return read_image(self.path) / np.float32(self.exposures[0].seconds)
-        images = [read_encoded(e.path)[..., :3] for e in self.exposures]
+        images = [read_exposure(e.path) for e in self.exposures]
         return merge_exposures(images, [e.seconds for e in self.exposures])
 
 
@@ -278,7 +281,9 @@ def usual_base_geometry(n_views: int) -> str:
 
 
 def check_photographs(capture: Capture) -> None:
-    """Demand that every photograph exists and has its camera's size (headers only).
+    """Demand that photographs and silhouettes exist and have their camera's size.
+
+    Only headers are read.
 
     Raises
     ------
@@ -296,6 +301,24 @@ def check_photographs(capture: Capture) -> None:
         camera = capture.cameras[photograph.camera]
         for exposure in photograph.exposures:
             _check_matches(exposure.path, camera, *image_size(exposure.path))
+    for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
+        if path is not None:
+            _check_matches(path, camera, *image_size(path))
+
+
+def check_environments(capture: Capture) -> None:
+    """Demand that every environment map exists.
+
+    Raises
+    ------
+    CaptureError
+        Naming the light and the file.
+    """
+    for light in capture.lights:
+        if light.file is not None and not light.file.is_file():
+            raise CaptureError(
+                f"{light.file}: environment map of light {light.id!r} missing; copy it there"
+            )
 
 
 def check_pairs(capture: Capture) -> None:
@@ -319,9 +342,11 @@ def check_pairs(capture: Capture) -> None:
 
 
 def _made_silhouette(capture: Capture, view: int) -> NDArray[np.float32]:
-    photographs = (p for p in capture.photographs if p.camera == view)
+    indices = [i for i, p in enumerate(capture.photographs) if p.camera == view]
+    step = -(-len(indices) // SILHOUETTE_SAMPLE) or 1
     return silhouette_from_photographs(
-        (p.read() for p in photographs), name=f"view {capture.cameras[view].id!r}"
+        (capture.read_photograph(i) for i in indices[::step]),
+        name=f"view {capture.cameras[view].id!r}",
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from reflfield.capture import lp, middlebury, native, transforms_json
 from reflfield.capture.documents import read_json, read_text
-from reflfield.capture.model import Capture, check_pairs, check_photographs
+from reflfield.capture.model import Capture, check_environments, check_pairs, check_photographs
 from reflfield.errors import CaptureError
 
 
@@ -65,6 +65,7 @@ def open_capture(
     else:
         description, found = path, format or _kind_of_file(path)
     capture = READERS[found].read(description)
+    check_environments(capture)
     if require_photographs:
         check_pairs(capture)
         check_photographs(capture)

@@ -188,6 +188,14 @@ class TestExposures:
         merged = merge_exposures(shots, [1.0, 2.0, 4.0])
         np.testing.assert_array_equal(merged, merge_exposures(shots[::-1], [4.0, 2.0, 1.0]))
 
+    def test_grey_and_exr_exposures(self, tmp_path):
+        write_png(tmp_path / "g.png", np.array([[0, 51, 255]], np.uint8))
+        grey = images.read_exposure(tmp_path / "g.png")
+        np.testing.assert_allclose(grey[0, :, 2], [0, 0.2, 1], rtol=1e-6)
+        write_exr(tmp_path / "e.exr", np.array([[[0.0, 0.214041, 5.0]]], np.float32))
+        linear = images.read_exposure(tmp_path / "e.exr")
+        np.testing.assert_allclose(linear, [[[0, 0.5, 1]]], atol=1e-6)
+
     def test_saturated_and_black_everywhere(self):
         white, black = np.ones((1, 1, 3), np.float32), np.zeros((1, 1, 3), np.float32)
         assert merge_exposures([white, white], [0.5, 4.0])[0, 0, 0] == 2.0

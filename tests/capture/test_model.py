@@ -210,6 +210,12 @@ class TestSummary:
         capture = Capture("x", Path(), cameras, (Light("a", "unknown"),), ())
         np.testing.assert_allclose(object_centre(capture), 0, atol=1e-8)
 
+    def test_gap_between_the_axes(self):
+        axes = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1.0]])
+        gap = largest_gap(axes, axes[4])
+        # the cube's diagonal; probes are about 3 degrees apart
+        assert np.degrees(gap) == pytest.approx(np.degrees(np.arccos(1 / 3**0.5)), abs=3)
+
     def test_gap_shrinks_with_more_directions(self, rng):
         directions = rng.normal(size=(400, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)

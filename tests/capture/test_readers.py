@@ -130,6 +130,7 @@ class TestNative:
             del document["cameras"][0]["silhouette"]
             document["lights"] = [{"id": "sky", "type": "environment", "file": "sky.exr"}]
 
+        write_exr(native / "sky.exr", np.ones((2, 4, 3), np.float32))
         capture = open_capture(edited(native, change))
         assert capture.up.tolist() == [0, 1, 0]
         assert capture.cameras[0].kind == "orthographic"
@@ -243,7 +244,10 @@ class TestNative:
     def test_silhouette_of_another_size(self, native):
         write_png(native / "silhouettes/v001.png", np.full((5, 8), 255, np.uint8))
         with pytest.raises(CaptureError, match=r"v001\.png.*image size"):
-            open_capture(native).read_silhouette(1)
+            open_capture(native)
+        (native / "silhouettes/v001.png").unlink()
+        with pytest.raises(CaptureError, match=r"v001\.png.*cannot be read"):
+            open_capture(native)
 
     def test_link_that_leaves_the_folder(self, native, tmp_path):
         outside = tmp_path / "outside.exr"
@@ -344,6 +348,10 @@ class TestTransforms:
             frame("b", environment="maps/sky.exr"),
             frame("c", environment="maps/sky.exr", environment_convention="blender"),
         ]
+        with pytest.raises(CaptureError, match=r"sky\.exr: environment map of light 'l000'"):
+            self.open(tmp_path / "c", frames)
+        (tmp_path / "c/maps").mkdir()
+        write_exr(tmp_path / "c/maps/sky.exr", np.ones((2, 4, 3), np.float32))
         capture = self.open(tmp_path / "c", frames)
         assert [light.kind for light in capture.lights] == ["environment"] * 2
         assert [light.convention for light in capture.lights] == ["mitsuba", "blender"]

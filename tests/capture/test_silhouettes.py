@@ -80,6 +80,12 @@ class TestUniformBackdrop:
         found = silhouette_from_photographs([composed(truth, front, 0.0)])
         assert overlap(found, truth) > 0.97
 
+    def test_faint_glow_is_followed_only_near_the_object(self):
+        photograph = composed(disc(), 0.6, 0.0)
+        photograph[79:82, 125:158] = 0.6 * decode_srgb(0.03)  # a thread of lit cloth
+        found = silhouette_from_photographs([photograph])
+        assert (found[:, 135:] == 0).all()
+
     def test_object_may_leave_the_frame(self):
         truth = disc((80, 10), 45)
         found = silhouette_from_photographs([composed(truth, 0.6, 0.0)])
