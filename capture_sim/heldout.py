@@ -43,12 +43,17 @@ def heldout_pairs(scene: Scene) -> list[tuple[dict[str, Any], dict[str, Any]]]:
         camera every frame keeps it: only the light is unseen then.
     """
     rng = np.random.default_rng((scene.seed, 1))
-    names = [f"h{frame:03d}" for frame in range(scene.heldout_frames)]
-    return [
-        ({**_unseen_camera(scene.cameras, scene.mesh.centre, rng), "id": name},
-         {**_unseen_light(scene.lights, scene.mesh.centre, rng), "id": name})
-        for name in names
-    ]  # fmt: skip
+    return [_pair(scene, f"h{frame:03d}", rng) for frame in range(scene.heldout_frames)]
+
+
+def _pair(
+    scene: Scene, name: str, rng: np.random.Generator
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    centre = scene.mesh.centre
+    camera = _unseen_camera(scene.cameras, centre, rng)
+    viewer = world_from_camera(camera)[:3, 3]
+    light = _unseen_light(scene.lights, centre, viewer, rng)
+    return {**camera, "id": name}, {**light, "id": name}
 
 
 def _unseen_camera(
@@ -67,11 +72,13 @@ def _unseen_camera(
 
 
 def _unseen_light(
-    lights: Sequence[Table], centre: Array, rng: np.random.Generator
+    lights: Sequence[Table], centre: Array, viewer: Array, rng: np.random.Generator
 ) -> dict[str, Any]:
+    """Light on the viewer's side if there is one: pictures of the dark side say little."""
     positions = np.stack([_light_position(light, centre) for light in lights])
     intensities = np.stack([_light_intensity(light) for light in lights])
-    position, chosen, weights = _mixture(positions, centre, rng)
+    frontal = np.flatnonzero((positions - centre) @ (viewer - centre) > 0.0)
+    position, chosen, weights = _mixture(positions, centre, rng, first_of=frontal)
     intensity = weights @ intensities[chosen]
     return {"type": "point", "position": position.tolist(), "intensity": intensity.tolist()}
 
@@ -90,17 +97,22 @@ def _light_intensity(light: Table) -> Array:
 
 
 def _mixture(
-    positions: Array, centre: Array, rng: np.random.Generator
+    positions: Array,
+    centre: Array,
+    rng: np.random.Generator,
+    first_of: NDArray[np.intp] | None = None,
 ) -> tuple[Array, NDArray[np.intp], Array]:
     """Position between neighbours, seen from the centre; the neighbours; their weights.
 
-    Directions and distances are mixed separately: the mixture of points of a
-    dome lies on the dome, not under it.
+    The first neighbour is drawn from `first_of` (indices; all if none are given), the
+    others are the nearest to it. Directions and distances are mixed separately: the
+    mixture of points of a dome lies on the dome, not under it.
     """
     offsets = positions - centre
     distances = np.linalg.norm(offsets, axis=1)
     directions = offsets / distances[:, None]
-    first = rng.integers(len(positions))
+    candidates = first_of if first_of is not None and len(first_of) else len(positions)
+    first = rng.choice(candidates)
     nearness = directions @ directions[first]
     chosen = np.argsort(-nearness, kind="stable")[:3]
     weights = rng.dirichlet(np.full(len(chosen), _CONCENTRATION))

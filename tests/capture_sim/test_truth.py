@@ -168,6 +168,17 @@ def test_heldout_views_and_lights_are_new_but_within_the_rig():
         assert np.linalg.norm(lights - light["position"], axis=1).min() > 0.01
 
 
+def test_heldout_lights_stand_on_the_side_of_the_viewer():
+    towards = [
+        (world_from_camera(camera)[:3, 3], np.array(light["position"]))
+        for camera, light in heldout_pairs(scene(heldout={"frames": 20}))
+    ]
+    cosines = [v @ l / np.linalg.norm(v) / np.linalg.norm(l) for v, l in towards]  # noqa: E741
+    # The nearest light of the mixture does; its neighbours may lie a little behind.
+    assert min(cosines) > -0.3
+    assert np.median(cosines) > 0.3
+
+
 def test_distant_lights_are_held_out_far_away():
     sunny = scene(lights={"preset": "fibonacci", "n": 5, "kind": "directional"})
     (_, light), *_ = heldout_pairs(sunny)
