@@ -298,11 +298,12 @@ def undistort(distorted: Array, distortion: tuple[float, ...]) -> Array:
     array([[1., 0.]])
     """
     limit = largest_radius(distortion)
+    converged = 4 * np.finfo(np.float64).eps * max(1.0, float(np.abs(distorted).max(initial=0)))
     with np.errstate(all="ignore"):
         ideal = distorted * np.minimum(1.0, 0.9 * limit / _radii(distorted))[:, None]
         for _ in range(NEWTON_STEPS):
             residual = distort(ideal, distortion) - distorted
-            if not np.max(np.abs(residual), initial=0.0) > NEWTON_TOLERANCE**2:
+            if np.max(np.abs(residual), initial=0.0) <= converged:
                 break
             ideal = ideal - _solve_2x2(_lens_jacobian(ideal, distortion), residual)
             # A step over the fold would land on the wrong branch.
