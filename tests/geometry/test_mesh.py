@@ -97,7 +97,8 @@ def test_smoothing_removes_noise_and_keeps_the_volume(rng):
     before = np.std(np.linalg.norm(noisy.vertices, axis=1))
     after = np.std(np.linalg.norm(smoothed.vertices, axis=1))
     assert after < 0.45 * before  # white noise: most of its power is at short wavelengths
-    assert smoothed.volume == pytest.approx(noisy.volume, rel=2e-3)
+    # The pass band's gain is slightly above one: ten pairs of steps swell a ball by .2 %.
+    assert smoothed.volume == pytest.approx(noisy.volume, rel=4e-3)
     np.testing.assert_array_equal(smoothed.faces, noisy.faces)
 
 
@@ -110,7 +111,9 @@ def test_decimation_stays_closed_anywhere_at_any_size(origin, size):
     assert small.watertight
     assert len(small.faces) <= 800
     radii = np.linalg.norm(small.vertices - origin, axis=1) / size
-    np.testing.assert_allclose(radii, 1.0, atol=0.015)  # edges of .12: tangent planes meet at 1.007
+    np.testing.assert_allclose(
+        radii, 1.0, atol=0.015
+    )  # edges of .12: tangent planes meet at 1.007
 
 
 def test_decimation_repeats_itself_exactly():
