@@ -17,7 +17,7 @@ from reflfield.alignment.refinement import (
     improve_frames,
     refine_targets,
 )
-from reflfield.alignment.searching import SearchOptions, SearchResult, search
+from reflfield.alignment.searching import SearchResult, search
 from reflfield.checks import check_shape, unit_directions
 from reflfield.errors import InputError, ShapeError
 from reflfield.progress import track
@@ -359,9 +359,7 @@ def _finish(
         samples = _unit_samples(_read(task.source, part))
         new = ~trained[part]
         if new.any():
-            source = couple_samples(task, samples[new])
-            options: SearchOptions = {"max_tilt": task.max_tilt, "n_threads": task.n_threads}
-            _put(found, part[new], search(source, gauged.targets, **options))
+            _put(found, part[new], _search(task, couple_samples(task, samples[new]), gauged))
         if sharp:
             _refine_block(task, part, samples, found, sharp)
     last = sharp.regauged if sharp else gauged
@@ -375,6 +373,22 @@ def _finish(
         targets=last.targets,
         symmetries=tuple(symmetry.kind for symmetry in last.symmetries),
     )
+
+
+def _search(
+    task: _Task, source: Coupled, gauged: Gauged, start: NDArray[np.float64] | None = None
+) -> SearchResult:
+    """Search against the gauged targets, with margins; folded to the base frame."""
+    found = search(
+        source,
+        gauged.targets,
+        start=start,
+        max_tilt=task.max_tilt,
+        half_turns=[symmetry.kind == "half" for symmetry in gauged.symmetries],
+        n_threads=task.n_threads,
+    )
+    folded = _fold_all(found.rotations, found.cluster, gauged)
+    return replace(found, rotations=folded)
 
 
 def _put(into: SearchResult, rows: NDArray[np.int64], part: SearchResult) -> None:

@@ -41,7 +41,7 @@ COARSE_DEGREES = 7
 COARSE_ROTATIONS = 2500
 # Two rotations closer than this are the same peak.
 PEAK_DISTANCE = np.deg2rad(15.0)
-SCREENING_STEPS = 3
+SCREENING_STEPS = 2
 POLISHING_STEPS = 12
 # A step this short moves the peak by less than a hundredth of a degree.
 CONVERGED_STEP = 1e-4
@@ -174,30 +174,37 @@ def _complex_spectrum(
 ) -> None:
     """Rows m >= 0 of the complex series of a real one, those of m > 0 doubled."""
     offset, width = 0, row_start[1]
+    zero, one = series.dtype.type(0.0), series.dtype.type(1.0)
     root = series.dtype.type(np.sqrt(0.5))
     for j in range(row_start.shape[0] - 1):
         size = 2 * j + 1
         block = series[offset : offset + size * size].reshape(size, size)
         for m in range(j + 1):
             row = row_start[j] + m * width + width // 2
-            lead = 1 if m % 2 == 0 else -1
+            lead = one if m % 2 == 0 else -one
             if m == 0:
                 re[row] = block[j, j]
             else:
                 re[row] = 2 * lead * root * block[j + m, j]
                 im[row] = 2 * lead * root * block[j - m, j]
+            positive, negative = block[j + m, j:], block[j + m, : j + 1]
+            positive2, negative2 = block[j - m, j:], block[j - m, : j + 1]
+            up_re, up_im = re[row : row + j + 1], im[row : row + j + 1]
+            down_re, down_im = re[row - j : row + 1], im[row - j : row + 1]
+            sign, scale = one, (root if m == 0 else lead)
             for n in range(1, j + 1):
-                sign = 1 if n % 2 == 0 else -1
-                same, cross = block[j + m, j + n], block[j + m, j - n]
-                if m == 0:
-                    re[row + n], im[row + n] = sign * root * same, -sign * root * cross
-                    re[row - n], im[row - n] = root * same, root * cross
-                else:
-                    same2, cross2 = block[j - m, j - n], block[j - m, j + n]
-                    re[row + n] = lead * sign * (same + same2)
-                    im[row + n] = lead * sign * (cross2 - cross)
-                    re[row - n] = lead * (same - same2)
-                    im[row - n] = lead * (cross2 + cross)
+                sign = -sign
+                same, cross, same2, cross2 = positive[n], negative[j - n], zero, zero
+                if m > 0:
+                    same2, cross2 = negative2[j - n], positive2[n]
+                up_re[n], up_im[n] = (
+                    scale * sign * (same + same2),
+                    scale * sign * (cross2 - cross),
+                )
+                down_re[j - n], down_im[j - n] = (
+                    scale * (same - same2),
+                    scale * (cross2 + cross),
+                )
         offset += size * size
 
 
@@ -229,7 +236,7 @@ def _fill_plane(
     right: NDArray[np.floating],
     phases: NDArray[np.floating],
 ) -> None:
-    """cos and sin of m alpha + n gamma for all m >= 0 and n, rows as in `DegreeTables`."""
+    """Cos and sin of m alpha + n gamma for all m >= 0 and n, rows as in `DegreeTables`."""
     width = right.shape[1]
     fill_phases(alpha, 0, left)
     fill_phases(gamma, width // 2, right)

@@ -123,12 +123,13 @@ def _expectation(
 ) -> SearchResult:
     """Best rotation and target; from the earlier rotation first, where one is known."""
     if before is None or len(targets) > 1:
-        found = search(units, targets, **options)
+        found = search(units, targets, margins=False, **options)
         return found if before is None else _not_worse(units, targets, found, before, options)
     near = _from_before(units, targets, before, options)
     fell = np.flatnonzero(near.score < before.score)
     if len(fell) > 0:
-        again = search(units[fell], targets, start=near.rotations[fell], **options)
+        start = near.rotations[fell]
+        again = search(units[fell], targets, start=start, margins=False, **options)
         for name in ("rotations", "score", "margin", "cluster"):
             getattr(near, name)[fell] = getattr(again, name)
     return near
@@ -245,12 +246,13 @@ def seed_targets(
     tries = rng.choice(len(drawn), min(SEEDING_TRIALS, len(drawn)), False, chance)
     probe = slice(0, len(sample), max(1, len(sample) // 64))
     closeness = [
-        weight[probe] @ search(sample[probe], sample[i : i + 1], **options).score for i in tries
+        weight[probe] @ search(sample[probe], sample[i : i + 1], margins=False, **options).score
+        for i in tries
     ]
     chosen = [int(tries[int(np.argmax(closeness))])]
     nearest = np.full(len(sample), -1.0)
     while len(chosen) < min(n_clusters, len(sample)):
-        last = search(sample, sample[chosen[-1] : chosen[-1] + 1], **options)
+        last = search(sample, sample[chosen[-1] : chosen[-1] + 1], margins=False, **options)
         nearest = np.maximum(nearest, last.score)
         distance = np.maximum(1.0 - nearest, 0.0) * weight
         distance[chosen] = 0.0

@@ -31,6 +31,8 @@ BLOCK = 256
 N_PEAKS = 4
 # Targets whose coarse peak is among the best few are searched with all degrees.
 N_FINALISTS = 3
+# Peaks that reach less than this share of the highest after one step are given up.
+HOPEFUL = 0.8
 Result = TypeVar("Result")
 
 
@@ -72,6 +74,8 @@ def search(
     start: ArrayLike | None = None,
     max_tilt: float | None = None,
     n_peaks: int = N_PEAKS,
+    half_turns: Sequence[bool] = (),
+    margins: bool = True,
     n_threads: int = 1,
 ) -> SearchResult:
     r"""Rotations that best carry a target onto each function; the best target if many.
@@ -88,6 +92,11 @@ def search(
         Largest angle between z and the turned z, radians. None: all rotations.
     n_peaks : int
         Local maxima of the coarse grid that are followed with all degrees.
+    half_turns : sequence of bool
+        True for each target that a half turn about z leaves unchanged: two rotations that
+        differ by it then count as one in the margin. Empty: none.
+    margins : bool
+        False: leave the margins at 0, which saves a tenth of the time.
     n_threads : int
         Blocks worked on at once. The result does not depend on it.
 
@@ -125,9 +134,11 @@ def search(
     norms = np.maximum(target.norms(), 1e-300)
     targets = [target[k : k + 1].scaled(1.0 / norms[k : k + 1]) for k in range(len(target))]
 
+    plan = _Plan(tuple(targets), tuple(half_turns), max_tilt, n_peaks, margins)
+
     def block(rows: slice) -> SearchResult:
         extra = None if starts is None else starts[rows]
-        return _search_block(source[rows], targets, extra, max_tilt, n_peaks)
+        return _search_block(source[rows], extra, plan)
 
     parts = map_blocks(block, n, BLOCK, n_threads)
     return SearchResult(
@@ -164,6 +175,17 @@ def _check_search(
 
 
 @dataclass(frozen=True, eq=False)
+class _Plan:
+    """What all blocks of one search share: unit targets and options."""
+
+    targets: tuple[Coupled, ...]
+    half_turns: tuple[bool, ...]
+    max_tilt: float | None
+    n_peaks: int
+    margins: bool
+
+
+@dataclass(frozen=True, eq=False)
 class _Candidates:
     """Rotations in question: `rows` sorted, one entry per function and candidate."""
 
@@ -172,18 +194,14 @@ class _Candidates:
 
 
 def _search_block(
-    source: Coupled,
-    targets: Sequence[Coupled],
-    start: NDArray[np.float64] | None,
-    max_tilt: float | None,
-    n_peaks: int,
+    source: Coupled, start: NDArray[np.float64] | None, plan: _Plan
 ) -> SearchResult:
     """Search of a few functions against all (unit) targets."""
     norms = source.norms()
     # Unit functions, so that the float32 kernels never meet 1e-12 or 1e12.
     source = source.scaled(np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0))
-    series = [spectrum(source, target) for target in targets]
-    coarse = [_coarse_peaks(s, source.n_degrees, max_tilt, n_peaks) for s in series]
+    series = [spectrum(source, target) for target in plan.targets]
+    coarse = [_coarse_peaks(s, source.n_degrees, plan) for s in series]
     best = SearchResult(
         rotations=np.tile(np.eye(3), (len(source), 1, 1)),
         score=np.full(len(source), -np.inf),
@@ -192,10 +210,10 @@ def _search_block(
     )
     heights = np.stack([height for _, height in coarse])
     rank = np.argsort(np.argsort(-heights, axis=0, kind="stable"), axis=0, kind="stable")
-    for k in range(len(targets)):
+    for k in range(len(plan.targets)):
         final = np.flatnonzero(rank[k] < N_FINALISTS)
         candidates = _candidates(coarse[k][0], final, start)
-        _keep_better(best, series[k], candidates, k, max_tilt)
+        _keep_better(best, series[k], candidates, k, plan)
     nothing = ~(norms > 0) | ~np.isfinite(best.score)
     best.score[nothing] = 0.0
     best.margin[nothing] = 0.0
@@ -204,13 +222,13 @@ def _search_block(
 
 
 def _coarse_peaks(
-    series: NDArray[np.floating], n_degrees: int, max_tilt: float | None, n_peaks: int
+    series: NDArray[np.floating], n_degrees: int, plan: _Plan
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(n, n_peaks, 3, 3) rotations of the coarse maxima (NaN: fewer) and the highest value."""
     low = min(n_degrees, COARSE_DEGREES)
-    grid = coarse_grid(low, COARSE_ROTATIONS, max_tilt, str(series.dtype))
+    grid = coarse_grid(low, COARSE_ROTATIONS, plan.max_tilt, str(series.dtype))
     values = series[:, : block_offsets(low)[-1]] @ grid.blocks.T
-    found = np.full((len(series), n_peaks), -1, np.int32)
+    found = np.full((len(series), plan.n_peaks), -1, np.int32)
     highest_maxima(values, grid.neighbours, found)
     rotations = np.where(found[:, :, None, None] >= 0, grid.rotations[found], np.nan)
     return rotations, values.max(axis=1).astype(np.float64)
@@ -282,26 +300,42 @@ def _keep_better(
     series: NDArray[np.floating],
     candidates: _Candidates,
     k: int,
-    max_tilt: float | None,
+    plan: _Plan,
 ) -> None:
     """Update `best` in place with target k for the functions that have candidates."""
     if len(candidates.rows) == 0:
         return
-    rows = candidates.rows
-    moved, found = follow(series, rows, candidates.rotations, SCREENING_STEPS, max_tilt)
-    first = best_of_each(rows, found[:, 0])
+    rows, moved, values = _screen(series, candidates, plan.max_tilt)
+    first = best_of_each(rows, values)
     who = rows[first]
-    top, at_top = follow(series, who, moved[first], POLISHING_STEPS, max_tilt)
-    gap = np.minimum(
-        _gap_to_other_peaks(rows, moved, found[:, 0], who, top, at_top[:, 0]),
-        _gap_of_weakest_turn(series, who, top, at_top),
-    )
+    top, at_top = follow(series, who, moved[first], POLISHING_STEPS, plan.max_tilt)
     better = at_top[:, 0] > best.score[who]
-    who, top, at_top, gap = who[better], top[better], at_top[better], gap[better]
-    best.rotations[who] = top
-    best.score[who] = at_top[:, 0]
-    best.margin[who] = np.maximum(gap, 0.0)
-    best.cluster[who] = k
+    best.rotations[who[better]] = top[better]
+    best.score[who[better]] = at_top[better, 0]
+    best.cluster[who[better]] = k
+    if plan.margins:
+        half_turn = bool(plan.half_turns) and plan.half_turns[k]
+        apart = _apart(rows, moved, who, top, half_turn)
+        gap = np.minimum(
+            _gap_to_other_peaks(rows[apart], values[apart], who, at_top[:, 0]),
+            _gap_of_weakest_turn(series, who, top, at_top),
+        )
+        best.margin[who[better]] = np.maximum(gap, 0.0)[better]
+
+
+def _screen(
+    series: NDArray[np.floating], candidates: _Candidates, max_tilt: float | None
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Rows, rotations and values of the candidates after the steps each deserves."""
+    rows = candidates.rows
+    moved, found = follow(series, rows, candidates.rotations, 1, max_tilt)
+    values = found[:, 0]
+    highest = values[best_of_each(rows, values)]
+    index = np.cumsum(np.concatenate([[0], np.diff(rows) > 0]))
+    near = np.flatnonzero(values > HOPEFUL * highest[index])
+    moved[near], found = follow(series, rows[near], moved[near], SCREENING_STEPS, max_tilt)
+    values[near] = found[:, 0]
+    return rows, moved, values
 
 
 def best_of_each(rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -316,20 +350,33 @@ def best_of_each(rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArra
     return order[np.concatenate([[True], np.diff(rows[order]) > 0])]
 
 
-def _gap_to_other_peaks(
+def _apart(
     rows: NDArray[np.int64],
     moved: NDArray[np.float64],
-    values: NDArray[np.float64],
     who: NDArray[np.int64],
     top: NDArray[np.float64],
+    half_turn: bool,
+) -> NDArray[np.bool_]:
+    """True for candidates that ended elsewhere than the best of their function."""
+    product = moved * top[np.searchsorted(who, rows)]
+    columns = product.sum(axis=1)
+    limit = 1.0 + 2.0 * np.cos(PEAK_DISTANCE)
+    apart = columns.sum(axis=1) < limit
+    if half_turn:
+        apart &= columns[:, 2] - columns[:, 0] - columns[:, 1] < limit
+    return apart
+
+
+def _gap_to_other_peaks(
+    rows: NDArray[np.int64],
+    values: NDArray[np.float64],
+    who: NDArray[np.int64],
     height: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Height above the best candidate that ended elsewhere."""
+    """Height above the best of the candidates that ended elsewhere."""
     index = np.searchsorted(who, rows)
-    cosine = 0.5 * (np.einsum("nij,nij->n", moved, top[index]) - 1.0)
-    elsewhere = cosine < np.cos(PEAK_DISTANCE)
     gap = np.full(len(who), np.inf)
-    np.minimum.at(gap, index[elsewhere], (height[index] - values)[elsewhere])
+    np.minimum.at(gap, index, height[index] - values)
     return gap
 
 
@@ -342,11 +389,10 @@ def _gap_of_weakest_turn(
     """Height above the better of two turns about the axis of least curvature."""
     hessian = at_top[:, [4, 7, 8, 7, 5, 9, 8, 9, 6]].reshape(-1, 3, 3)
     axis = np.linalg.eigh(hessian)[1][:, :, 2]
-    gap = np.full(len(who), np.inf)
-    for angle in (PEAK_DISTANCE, -PEAK_DISTANCE):
-        turned = top @ rotation_about(axis, angle)
-        gap = np.minimum(gap, at_top[:, 0] - follow(series, who, turned, 0)[1][:, 0])
-    return gap
+    turned = [top @ rotation_about(axis, angle) for angle in (PEAK_DISTANCE, -PEAK_DISTANCE)]
+    both = np.stack(turned, axis=1).reshape(-1, 3, 3)
+    values = follow(series, np.repeat(who, 2), both, 0)[1][:, 0]
+    return at_top[:, 0] - values.reshape(-1, 2).max(axis=1)
 
 
 def rotation_about(axis: NDArray[np.float64], angle: ArrayLike) -> NDArray[np.float64]:
