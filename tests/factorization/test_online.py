@@ -8,6 +8,7 @@ from sklearn.decomposition import IncrementalPCA
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.factorization import OnlineSVD
+from reflfield.factorization.online import orthonormal_range, outside
 
 
 def fed(matrix, rank, block, *, dtype=np.float64, mean=False):
@@ -149,10 +150,30 @@ def test_basis_stays_orthonormal(rng, name, dtype):
     assert svd.basis.shape[1] <= min(10, *matrix.shape)
     if svd.basis.size:
         assert departure(svd.basis) < LIMIT[dtype]
+    values = np.zeros(len(svd.singular_values))
+    found = np.linalg.svd(matrix.astype(np.float64), compute_uv=False)[: len(values)]
+    values[: len(found)] = found
+    # Backward stable: absolute accuracy on the scale of the largest.
+    np.testing.assert_allclose(
+        svd.singular_values, values, atol=LIMIT[dtype] * max(values, default=0.0), rtol=0
+    )
     back = svd.basis.astype(np.float64) @ (svd.basis.T.astype(np.float64) @ matrix)
     largest = np.linalg.norm(matrix, axis=0).max()
     # Dropped directions are below 3e-6 or 1e-13 of the largest column, one a block at most.
     assert np.linalg.norm(back - matrix, axis=0).max() <= 4 * LIMIT[dtype] * largest
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(("dtype", "floor"), [(np.float32, 3e-6), (np.float64, 1e-13)])
+def test_columns_inside_the_basis_add_no_direction(rng, dtype, floor):
+    basis = np.linalg.qr(rng.standard_normal((80, 5)))[0].astype(dtype)
+    columns = (basis @ rng.standard_normal((5, 20))).astype(dtype)
+    assert orthonormal_range(outside(basis, columns), basis, 10 * floor).shape == (80, 0)
+    columns[:, 3] += dtype(1e3 * floor) * rng.standard_normal(80).astype(dtype)
+    extra = orthonormal_range(outside(basis, columns), basis, 10 * floor)
+    assert extra.shape == (80, 1)
+    # A direction found at the edge of rounding is still orthogonal to all the others.
+    assert np.abs(basis.T @ extra).max() < 16 * np.finfo(dtype).eps
 
 
 @pytest.mark.stability

@@ -1,0 +1,96 @@
+"""The two steps of block recursive least squares, against their formulas written out."""
+
+import numpy as np
+import pytest
+
+from reflfield.factorization.packed import outer_products, pack, unpack
+from reflfield.factorization.recursive import Model, RowStatistics, gram_of_samples, infer
+from reflfield.factorization.sources import Block, as_source, reader_of
+from reflfield.factorization.start import start_model, unbiased
+
+from .problems import problem
+
+
+def small_case(rng, *, centred, n_channels=2):
+    """A model and a block of float64 with weights anywhere in [0, 1]."""
+    n_rows, rank, k = 6 * n_channels, 3, 5
+    root = rng.standard_normal((rank, rank))
+    offset = rng.standard_normal(n_rows) if centred else np.zeros(n_rows)
+    basis, mean = rng.standard_normal((n_rows, rank)), rng.standard_normal(rank)
+    model = Model(offset, basis, mean, root @ root.T + np.eye(rank), 0.3, centred, n_channels)
+    weights = np.where(rng.random((6, k)) < 0.3, 0.0, rng.random((6, k)))
+    values = rng.standard_normal((n_rows, k))
+    values[np.repeat(weights == 0, n_channels, axis=0)] = 0
+    return model, Block(np.arange(k), values, weights)
+
+
+def posterior_of(model, block, j):
+    """Mean and covariance of one column's coefficients, from the joint Gaussian."""
+    w = np.diag(np.repeat(block.weights[:, j], model.n_channels))
+    prior = np.linalg.solve(model.prior_covariance, np.eye(3))
+    covariance = np.linalg.solve(
+        model.basis.T @ w @ model.basis / model.noise + prior, np.eye(3)
+    )
+    right = model.basis.T @ w @ (block.values[:, j] - model.offset) / model.noise
+    return covariance @ (right + prior @ model.prior_mean), covariance
+
+
+@pytest.mark.parametrize("centred", [False, True])
+def test_posterior_is_that_of_the_gaussian_model(rng, centred):
+    model, block = small_case(rng, centred=centred)
+    found = infer(model, block, gram_of_samples(model.basis, 2))
+    for j in range(5):
+        mean, covariance = posterior_of(model, block, j)
+        np.testing.assert_allclose(found.mean[j], mean, rtol=1e-10)
+        np.testing.assert_allclose(found.covariance[j], covariance, rtol=1e-10)
+        w = np.repeat(block.weights[:, j], 2)
+        residual = block.values[:, j] - model.offset - model.basis @ mean
+        assert found.squared_residual[j] == pytest.approx((w * residual**2).sum(), rel=1e-10)
+
+
+@pytest.mark.parametrize("centred", [False, True])
+def test_rows_minimise_the_expected_squared_residual(rng, centred):
+    model, block = small_case(rng, centred=centred)
+    posterior = infer(model, block, gram_of_samples(model.basis, 2))
+    statistics = RowStatistics(model)
+    counted = np.array([True, True, False, True, True])
+    statistics.add(block, posterior, counted)
+    strength = 0.1 * np.eye(statistics.width)
+    rows = statistics.solve_rows(np.zeros_like(statistics.cross), strength)
+    first = int(centred)
+    for row in range(len(model.basis)):
+        left, right = strength.copy(), np.zeros(statistics.width)
+        for j in np.flatnonzero(counted):
+            z = np.concatenate([np.ones(first), posterior.mean[j]])
+            second = np.outer(z, z)
+            second[first:, first:] += posterior.covariance[j]
+            w = block.weights[row // 2, j]
+            left += w * second
+            right += w * block.values[row, j] * z
+        np.testing.assert_allclose(rows[row], np.linalg.solve(left, right), rtol=1e-8)
+    assert statistics.count == 4
+
+
+def test_packed_matrices_come_back(rng):
+    half = rng.standard_normal((4, 3, 3))
+    symmetric = half + half.transpose(0, 2, 1)
+    np.testing.assert_array_equal(unpack(pack(symmetric), 3), symmetric)
+    vectors = rng.standard_normal((4, 3))
+    np.testing.assert_array_equal(
+        unpack(outer_products(vectors), 3), vectors[:, :, None] * vectors[:, None, :]
+    )
+
+
+def test_unbiased_variance_counts_what_was_spent():
+    # Rank 2 spends 2 (40 + 50 - 2) = 176 parameters; never under a tenth of the entries.
+    assert unbiased(2000.0, 2000, (40, 50), 2) == pytest.approx(2000 / (2000 - 176))
+    assert unbiased(1.0, 100, (40, 50), 2) == pytest.approx(1 / 10)
+
+
+def test_start_reaches_the_noise(rng):
+    data = problem("smooth", rng, n_directions=24, n_columns=400)
+    reader = reader_of(as_source(data.measured, data.observed), 1, 200)
+    for seed in range(4):
+        order = np.random.default_rng(seed).permutation(400)
+        _, floor = start_model(reader, order, 6, 200, False, np.random.default_rng(seed))
+        assert np.sqrt(floor) * reader.scale == pytest.approx(0.01, rel=0.1)
