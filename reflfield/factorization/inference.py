@@ -66,7 +66,7 @@ def infer_coefficients(
         basis=completion.basis.astype(reader.dtype),
         prior_mean=np.zeros(completion.rank),
         prior_covariance=used.T @ used / max(len(used), 1),
-        noise=max((completion.noise / scale) ** 2, np.finfo(np.float32).tiny),
+        noise=float(max((completion.noise / scale) ** 2, 1e-30)),
         centred=False,
         n_channels=n_channels,
     )

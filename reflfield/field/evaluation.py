@@ -2,9 +2,9 @@
 
 Directions are rotated into the texel's frame and interpolated bilinearly on
 the grid of views (4 taps) and of lights (4 taps). A direction below the local
-horizon reads the horizon. Light from below the horizon fades out: local frames
-follow the data, not the base geometry, so a frame may be tilted against the
-light by a few degrees without the surface being dark.
+horizon reads the horizon. The cosine of the light is multiplied to what is
+interpolated (`softened_cosine`): frames follow the data, not the base geometry, so a
+light a few degrees below a texel's horizon may still reach it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField
-from reflfield.sphere.hemisphere import first_tap, square_from_xyz
-
-# Light this far below a texel's horizon, as the sine of 5 degrees, counts
-# nothing; between here and the horizon its share rises as a smoothstep.
-FADE_DEPTH = 0.0872
-
+from reflfield.sphere.hemisphere import first_tap, softened_cosine_of, square_from_xyz
 
 # Kernel helpers are typed by numba; to mypy their scalars are Any.
 
@@ -64,12 +59,6 @@ def _inverse_domain(value: Any, power: int) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _share_of_light(z: Any) -> Any:
-    share = min(max(1.0 + z / FADE_DEPTH, 0.0), 1.0)
-    return np.float32(share * share * (3.0 - 2.0 * share))
-
-
-@numba.njit(cache=True, nogil=True)
 def _add_taps(nodes: Any, view_taps: Any, light_taps: Any, tap_sum: Any) -> None:
     """Add the 16 taps of all components and channels to `tap_sum`."""
     for a in range(4):
@@ -103,8 +92,8 @@ def _evaluate(
             continue
         view_taps = _local_taps(local_from_world[texel], views[i], sides[0])
         light_taps = _local_taps(local_from_world[texel], lights[i], sides[1])
-        share = _share_of_light(light_taps[5])
-        if share == 0.0:
+        cosine = np.float32(softened_cosine_of(light_taps[5]))
+        if cosine == 0.0:
             continue
         tap_sum[:] = 0.0
         _add_taps(table[cluster[texel]], view_taps, light_taps, tap_sum)
@@ -112,7 +101,7 @@ def _evaluate(
             value = np.float32(0.0)
             for k in range(tap_sum.shape[0]):
                 value += component_weights[texel, k] * tap_sum[k, channel]
-            out[i, channel] = share * _inverse_domain(value, power)
+            out[i, channel] = cosine * _inverse_domain(value, power)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -161,8 +150,8 @@ def _sum_lights(
             if not lit[i % len(lit), j]:
                 continue
             taps = _local_taps(local_from_world[texel], lights[j], light_side)
-            share = _share_of_light(taps[5])
-            if share == 0.0:
+            cosine = np.float32(softened_cosine_of(taps[5]))
+            if cosine == 0.0:
                 continue
             for channel in range(3):
                 value = np.float32(0.0)
@@ -170,7 +159,7 @@ def _sum_lights(
                     node, corner = _corner(b, taps)
                     value += corner * responses[i, node, channel]
                 radiance = irradiances[j, channel] * _inverse_domain(value, power)
-                out[i, channel] += share * radiance
+                out[i, channel] += cosine * radiance
 
 
 def evaluate(

@@ -5,11 +5,14 @@ cluster holds a mean and K basis functions of two directions, on the nodes of
 two `HemisphereGrid`. The sample for view v and light l, both in the texel's
 frame, is
 
-    value(v, l) = D^-1( mean(v, l) + sum_k coefficient_k basis_k(v, l) ),
+    value(v, l) = s(l) D^-1( mean(v, l) + sum_k coefficient_k basis_k(v, l) ),
 
 bilinear on both grids, with D the `domain`: the signed cube root by default.
 Samples are radiance divided by the irradiance of a surface facing the light,
-so the cosine (and, unless it was factored out, the shadow) is included.
+so the cosine (and, unless it was factored out, the shadow) is included: s is that
+cosine, rounded at the horizon (`sphere.hemisphere.softened_cosine`), or 1 where the
+direction of the light does not vary. It stands outside the interpolation because its
+root falls to the horizon too steeply for any grid.
 
 Arrays are kept as they are stored, quantised; properties decode them when
 first asked for. A field opened from a file reads only what is used.

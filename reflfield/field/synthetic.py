@@ -23,8 +23,8 @@ from reflfield.field.model import (
 from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.sphere.rotations import frames_from_normals
 
-# Samples (n_views, n_lights, 3), cosine included, of local views (n_views, 3) and
-# local lights (n_lights, 3).
+# Reflectance (n_views, n_lights, 3) in 1/sr, without the light's cosine, of local views
+# (n_views, 3) and local lights (n_lights, 3).
 Samples = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -106,7 +106,7 @@ def sphere_surface(height: int = 32, radius: float = 1.0) -> BaseSurface:
 
 
 def lambert(albedo: Any) -> Samples:
-    """Samples ``albedo / pi * cos`` of a diffuse surface.
+    """Reflectance ``albedo / pi`` of a diffuse surface.
 
     Examples
     --------
@@ -116,14 +116,14 @@ def lambert(albedo: Any) -> Samples:
     """
 
     def samples(views: NDArray[np.float64], lights: NDArray[np.float64]) -> NDArray[np.float64]:
-        radiance = np.maximum(lights[:, 2:], 0.0) * np.asarray(albedo, float) / np.pi
-        return np.broadcast_to(radiance, (len(views), len(lights), 3))
+        reflectance = np.asarray(albedo, float) / np.pi
+        return np.broadcast_to(reflectance, (len(views), len(lights), 3))
 
     return samples
 
 
 def blinn_phong(albedo: Any, specular: Any, exponent: float) -> Samples:
-    """Diffuse samples plus a lobe ``specular * (n . h) ** exponent * cos``.
+    """Diffuse reflectance plus a lobe ``specular * (n . h) ** exponent``.
 
     Examples
     --------
@@ -136,7 +136,7 @@ def blinn_phong(albedo: Any, specular: Any, exponent: float) -> Samples:
         half = views[:, None] + lights[None]
         half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-12)
         lobe = np.maximum(half[..., 2:], 0.0) ** exponent * np.asarray(specular, float)
-        return lambert(albedo)(views, lights) + lobe * np.maximum(lights[:, 2:], 0.0)
+        return lambert(albedo)(views, lights) + lobe
 
     return samples
 
@@ -157,7 +157,7 @@ def baked_field(
     surface : BaseSurface
         Where it goes.
     samples : callable
-        Samples for local views and lights, as `lambert` makes.
+        Reflectance for local views and lights, as `lambert` makes.
     view_side, light_side : int
         Sides of the grids.
     domain : {"cube_root", "square_root", "linear"}
@@ -169,14 +169,6 @@ def baked_field(
     -------
     ReflectanceField
         One cluster, no basis functions.
-
-    Notes
-    -----
-    Nodes take the samples at their directions. In the cube root a cosine then
-    falls to zero too fast over the last cell before the horizon (to a quarter,
-    half-way on 11 x 11 nodes): fields fitted to samples by least squares
-    do not show this (3.6 % root mean square, same nodes). Take the linear domain
-    where a test needs the cosine.
 
     Examples
     --------

@@ -31,7 +31,8 @@ class AtlasOptions:
     Parameters
     ----------
     resolution : int
-        Side of the square texture, texels; about 3/4 of them will be used.
+        Side of the square texture, texels; about half of them will be used. 0 leaves the
+        choice to the pipeline, which looks at the photographs.
     padding : int
         Empty texels between charts.
     time_limit_s : float
@@ -45,7 +46,7 @@ class AtlasOptions:
     resolution: int = 256
     padding: int = 2
     time_limit_s: float = 120.0
-    max_cost: float = 4.0
+    max_cost: float = 2.0
     method: str = "xatlas"
 
     def __post_init__(self) -> None:
@@ -53,7 +54,11 @@ class AtlasOptions:
             raise InputError(
                 f"method: expected one of {', '.join(_METHODS)}, received {self.method!r}"
             )
-        if self.resolution < 4 or self.padding < 0 or not self.time_limit_s > 0:
+        if (
+            (self.resolution != 0 and self.resolution < 4)
+            or self.padding < 0
+            or not self.time_limit_s > 0
+        ):
             raise InputError(
                 "atlas: expected resolution >= 4, padding >= 0 and time_limit_s > 0, received "
                 f"{self.resolution}, {self.padding} and {self.time_limit_s}"

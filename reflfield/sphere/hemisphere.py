@@ -227,3 +227,47 @@ class HemisphereGrid:
         else:
             _taps(directions, self.side, nodes, weights)
         return nodes, weights
+
+
+# Half width, as a cosine, of the band around the horizon in which the light's cosine is
+# rounded off (4.6 degrees): frames are known to a few degrees, so a light just below a
+# texel's horizon may still reach it.
+HORIZON_SOFTNESS = 0.08
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def softened_cosine_of(z: float) -> float:
+    """Scalar `softened_cosine` for use in kernels."""
+    if z >= HORIZON_SOFTNESS:
+        return z
+    if z <= -HORIZON_SOFTNESS:
+        return 0.0
+    return (z + HORIZON_SOFTNESS) ** 2 / (4.0 * HORIZON_SOFTNESS)
+
+
+def softened_cosine(z: NDArray[np.floating]) -> NDArray[np.floating]:
+    r"""Cosine of the light with a rounded foot at the horizon.
+
+    .. math:: s(z) = z \;(z \ge w), \quad (z + w)^2 / 4w \;(|z| < w), \quad 0 \;(z \le -w)
+
+    Once continuously differentiable. Fields hold samples divided by it: a sample
+    includes the light's cosine, whose cube root has infinite slope at the horizon and
+    would be lost between nodes.
+
+    Parameters
+    ----------
+    z : ndarray of float
+        Cosine of the angle between light and normal.
+
+    Returns
+    -------
+    ndarray of float
+        Not negative.
+
+    Examples
+    --------
+    >>> softened_cosine(np.array([0.5, 0.0, -0.08]))
+    array([0.5 , 0.02, 0.  ])
+    """
+    foot = (np.clip(z, -HORIZON_SOFTNESS, HORIZON_SOFTNESS) + HORIZON_SOFTNESS) ** 2
+    return np.where(z >= HORIZON_SOFTNESS, z, foot / (4.0 * HORIZON_SOFTNESS))

@@ -5,14 +5,17 @@ import pytest
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.field.evaluation import (
-    FADE_DEPTH,
     evaluate,
     light_response,
     sum_lights,
     texel_taps,
 )
 from reflfield.field.synthetic import baked_field, blinn_phong, lambert, square_surface
-from reflfield.sphere.hemisphere import HemisphereGrid
+from reflfield.sphere.hemisphere import (
+    HORIZON_SOFTNESS,
+    HemisphereGrid,
+    softened_cosine,
+)
 
 POWER = {"cube_root": 3, "square_root": 2, "linear": 1}
 
@@ -20,11 +23,6 @@ POWER = {"cube_root": 3, "square_root": 2, "linear": 1}
 def directions(rng, n):
     d = rng.normal(size=(n, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
-def share_of_light(z):
-    t = np.clip(1 + z / FADE_DEPTH, 0, 1)
-    return t * t * (3 - 2 * t)
 
 
 def evaluate_with_numpy(field, texels, views, lights):
@@ -43,7 +41,7 @@ def evaluate_with_numpy(field, texels, views, lights):
     sample = np.maximum(value, 0) ** POWER[field.domain]
     if field.light_side == 1:
         return sample
-    return sample * share_of_light(local_lights[:, 2:])
+    return sample * softened_cosine(local_lights[:, 2:])
 
 
 @pytest.mark.reference
@@ -103,9 +101,8 @@ def test_lambert_square_has_the_textbook_value():
     field = baked_field(square_surface(2), lambert([0.3, 0.6, 0.9]), light_side=17)
     tilted = [[np.sin(0.5), 0.0, np.cos(0.5)]]
     value = evaluate(field, [0], [[0, 0, 1]], tilted)[0]
-    # Bilinear on nodes h = 1/8 apart: the cube root of the cosine, f = (1 - m^2)^(1/3), is
-    # off by h^2/8 |f''| with |f''| < 0.8 here, its cube by 3 times that.
-    assert np.allclose(value, np.array([0.3, 0.6, 0.9]) / np.pi * np.cos(0.5), rtol=5e-3)
+    # The mean is stored in 16 bits: 3 / 65534 after the cube.
+    assert np.allclose(value, np.array([0.3, 0.6, 0.9]) / np.pi * np.cos(0.5), rtol=1e-4)
 
 
 def test_mirror_direction_is_brightest(rng):
@@ -119,13 +116,14 @@ def test_mirror_direction_is_brightest(rng):
     assert np.argmax(values / np.maximum(lights[:, 2], 0.3)) == 0
 
 
-def test_light_fades_out_below_the_horizon():
+def test_cosine_is_rounded_at_the_horizon():
     field = baked_field(square_surface(1), lambda v, l: np.ones((len(v), len(l), 3)))  # noqa: E741
-    z = np.linspace(-2 * FADE_DEPTH, FADE_DEPTH, 61)
+    z = np.linspace(-2 * HORIZON_SOFTNESS, HORIZON_SOFTNESS, 61)
     lights = np.stack([np.sqrt(1 - z**2), 0 * z, z], axis=1)
     values = evaluate(field, np.zeros(61, int), np.tile([[0, 0, 1.0]], (61, 1)), lights)[:, 0]
-    assert np.allclose(values, share_of_light(z), atol=1e-4)  # int16 mean: 1/65534, cubed
-    assert not values[z <= -FADE_DEPTH].any()
+    assert np.allclose(values, softened_cosine(z), atol=1e-4)  # int16 mean: 1/65534, cubed
+    # Just at the end of the foot float32 leaves its square.
+    assert values[z <= -HORIZON_SOFTNESS].max() < 1e-15
     assert (np.diff(values) >= -1e-6).all()
 
 

@@ -1,0 +1,332 @@
+"""The command ``reflfield``: parse, call the library, say what was made."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from reflfield import __version__
+from reflfield.errors import InputError, ReflfieldError
+from reflfield.progress import listening
+
+# The libraries that do the work take seconds to import: commands import what they need,
+# so that --help and wrong arguments answer at once.
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Dome photographs to relightable objects.",
+)
+errors = Console(stderr=True, highlight=False)
+
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")]
+Format = Annotated[
+    str | None,
+    typer.Option(help="native, transforms, middlebury or lp; detected by content if absent."),
+]
+Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
+Samples = Annotated[int, typer.Option(help="Rays per pixel, a square number.")]
+
+
+def main() -> None:
+    """Entry point: errors of input end with one message and status 2."""
+    try:
+        app()
+    except ReflfieldError as error:
+        errors.print(f"reflfield: error: {error}", markup=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        errors.print("reflfield: interrupted; the same command goes on where it stopped")
+        sys.exit(130)
+
+
+@contextmanager
+def progress_bars() -> Iterator[None]:
+    """Show the progress of all work inside the block, with the time left."""
+    columns = (
+        TextColumn("{task.description:<38}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=errors, transient=not errors.is_terminal) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def listen(description: str, done: int, total: int) -> None:
+            if done == 0 or description not in tasks:
+                if description in tasks:
+                    bars.remove_task(tasks[description])
+                tasks[description] = bars.add_task(description, total=total)
+            bars.update(tasks[description], completed=done, total=total)
+
+        with listening(listen):
+            yield
+
+
+def say(line: str) -> None:
+    """One line of result on standard output."""
+    print(line, flush=True)
+
+
+@app.callback(invoke_without_command=True)
+def version_option(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Dome photographs to relightable objects."""
+    if version:
+        say(f"reflfield {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    out: Out = Path("demo"),
+    workers: Workers = 0,
+) -> None:
+    """Simulate a small dome of a vase, process it, and compare with held-out photographs."""
+    from reflfield.demo import run_demo
+
+    started = time.perf_counter()
+    with progress_bars():
+        job = run_demo(out, n_workers(workers))
+    say_results(job, started)
+
+
+@app.command()
+def run(
+    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    out: Out,
+    config: Annotated[Path | None, typer.Option(help="Options in TOML.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="stage.option=value", help="One option; repeatable."),
+    ] = None,
+    hold_out: Annotated[
+        str, typer.Option(metavar="views=K,lights=K", help="Kept for comparison.")
+    ] = "",
+    from_: Annotated[
+        str | None, typer.Option("--from", metavar="STAGE", help="Compute again from here.")
+    ] = None,
+    until: Annotated[str, typer.Option(metavar="STAGE", help="Stop after this.")] = "report",
+    workers: Workers = 0,
+    max_memory: Annotated[str, typer.Option(help="Ceiling of resident memory.")] = "4GB",
+    format: Format = None,
+) -> None:
+    """Make a relightable field of a capture, with a report."""
+    from reflfield.capture.readers import open_capture
+    from reflfield.config import Resources, parse_bytes, parse_hold_out
+    from reflfield.pipeline import run as run_pipeline
+
+    started = time.perf_counter()
+    options = pipeline_options(config, set_ or [])
+    resources = Resources(n_workers(workers), parse_bytes(max_memory))
+    held = parse_hold_out(hold_out)
+    opened = open_capture(capture, format)
+    with progress_bars():
+        job = run_pipeline(
+            opened, out, options, hold_out=held, resources=resources, first=from_, last=until
+        )
+    say_results(job, started)
+
+
+@app.command()
+def relight(
+    field: Annotated[Path, typer.Argument(help="A field.rfld.")],
+    out: Out,
+    frames: Annotated[
+        Path | None, typer.Option(help="Frames with cameras and lights of their own.")
+    ] = None,
+    orbit: Annotated[int | None, typer.Option(help="Frames of a turntable.")] = None,
+    environment: Annotated[
+        Path | None, typer.Option(help="Latitude-longitude map for the turntable.")
+    ] = None,
+    convention: Annotated[str, typer.Option(help="openexr, mitsuba or blender.")] = "openexr",
+    light: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Direction to a distant light.")
+    ] = None,
+    samples: Samples = 16,
+    size: Annotated[int, typer.Option(help="Side of turntable pictures, pixels.")] = 400,
+    elevation: Annotated[
+        float, typer.Option(help="Of the turntable's camera, degrees.")
+    ] = 20.0,
+    workers: Workers = 0,
+    format: Format = None,
+) -> None:
+    """Render frames, or a turntable under an environment map or a distant light."""
+    from reflfield.field.file import open_field
+    from reflfield.relighting.renderer import RenderOptions
+
+    if (frames is None) == (orbit is None):
+        raise InputError("relight: expected either --frames FRAMES or --orbit N, one of them")
+    options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
+    opened = open_field(field)
+    with progress_bars():
+        if frames is not None:
+            made = relight_to(opened, frames, out, options, format)
+        else:
+            lights = turntable_lights(environment, convention, light)
+            made = orbit_to(opened, lights, out, options, orbit or 1, size, elevation)
+    for path in made:
+        say(str(path))
+
+
+def relight_to(
+    field: Any, frames: Path, out: Path, options: Any, format_: str | None
+) -> list[Path]:
+    """Relight frames; their EXR files."""
+    from reflfield.capture.readers import open_capture
+    from reflfield.relighting.frames import relight_frames
+
+    opened = open_capture(frames, format_, require_photographs=False)
+    return [frame.exr for frame in relight_frames(field, opened, out, options)]
+
+
+def turntable_lights(environment: Path | None, convention: str, light: str | None) -> Any:
+    """What lights the turntable: a map or one distant light."""
+    import numpy as np
+
+    from reflfield.capture.lights import Light
+    from reflfield.relighting.environment import EnvironmentMap
+
+    if (environment is None) == (light is None):
+        raise InputError("relight --orbit: expected either --environment MAP or --light X,Y,Z")
+    if environment is not None:
+        return EnvironmentMap.open(environment, convention)
+    try:
+        direction = [float(part) for part in str(light).split(",")]
+    except ValueError:
+        direction = []
+    if len(direction) != 3 or not any(direction):
+        raise InputError(f"--light: expected X,Y,Z, not all zero, received {light!r}")
+    return Light(
+        "turntable", "directional", direction=np.array(direction), intensity=np.full(3, np.pi)
+    )
+
+
+def orbit_to(
+    field: Any, lights: Any, out: Path, options: Any, n_frames: int, size: int, elevation: float
+) -> list[Path]:
+    """Render a turntable; animation and contact sheet."""
+    from reflfield.relighting.orbit import OrbitOptions, render_orbit
+
+    up = tuple(field.metadata.get("up", (0.0, 0.0, 1.0)))
+    orbit = OrbitOptions(n_frames=n_frames, up=up, elevation_deg=elevation, size=size)
+    made = render_orbit(field, lights, out, orbit, options)
+    return [made.animation, made.contact_sheet]
+
+
+@app.command()
+def compare(
+    field: Annotated[Path, typer.Argument(help="A field.rfld.")],
+    frames: Annotated[Path, typer.Argument(help="Frames with photographs.")],
+    out: Out,
+    samples: Samples = 16,
+    workers: Workers = 0,
+    format: Format = None,
+) -> None:
+    """Relight frames and measure them against their photographs."""
+    from reflfield.capture.readers import open_capture
+    from reflfield.field.file import open_field
+    from reflfield.relighting.renderer import RenderOptions
+    from reflfield.steps.standalone import write_standalone_comparison
+
+    options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
+    opened = open_field(field)
+    with progress_bars():
+        comparison = write_standalone_comparison(
+            opened, open_capture(frames, format), out, options
+        )
+    say_metrics(comparison.to_dict())
+    say(f"metrics   {out / 'metrics.json'}")
+    say(f"report    {out / 'report' / 'index.html'}")
+
+
+@app.command()
+def inspect(
+    path: Annotated[Path, typer.Argument(help="A capture or a field.rfld.")],
+    format: Format = None,
+) -> None:
+    """Say what a capture or a field holds."""
+    if path.suffix.lower() == ".rfld":
+        from reflfield.field.file import describe as describe_field
+        from reflfield.field.file import open_field
+
+        lines = describe_field(open_field(path)).lines()
+    else:
+        from reflfield.capture.inspect import describe
+        from reflfield.capture.readers import open_capture
+
+        lines = describe(open_capture(path, format)).lines()
+    for line in lines:
+        say(line)
+
+
+# --- helpers ------------------------------------------------------------------------------
+
+
+def n_workers(wanted: int) -> int:
+    """Threads to use; 0 takes one per core that this process may use."""
+    import os
+
+    if wanted < 0:
+        raise InputError(f"--workers: expected 0 or more, received {wanted}")
+    return wanted or len(os.sched_getaffinity(0))
+
+
+def pipeline_options(config: Path | None, settings: list[str]) -> Any:
+    """Options from a file, overridden by single settings."""
+    from reflfield.config import merged, parse_settings, read_toml, with_tables
+    from reflfield.steps.options import PipelineOptions
+
+    tables = read_toml(config) if config is not None else {}
+    return with_tables(PipelineOptions(), merged(tables, parse_settings(settings)))
+
+
+def say_results(job: Any, started: float) -> None:
+    """Time per stage, metrics, and where everything is."""
+    import json
+
+    for record in job.stages.records:
+        state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
+        say(f"{record.name:<14}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
+    metrics = job.out / "metrics.json"
+    if metrics.is_file() and any(r.name == "report" for r in job.stages.records):
+        say_metrics(json.loads(metrics.read_text()))
+    say(f"total         {time.perf_counter() - started:8.1f} s")
+    for name in ("field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
+                 "metrics.json", "timings.json", "report/index.html"):  # fmt: skip
+        if (job.out / name).is_file():
+            say(f"{job.out / name}")
+
+
+def say_metrics(metrics: dict[str, Any]) -> None:
+    """Mean metrics in one line."""
+    mean = metrics["mean"]
+    if mean:
+        say(
+            f"{len(metrics['frames'])} frames: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
+            f"{mean['psnr_hdr']:.2f} dB (HDR), SSIM {mean['ssim']:.4f}, FLIP {mean['flip']:.4f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""The demo: a simulated dome of a vase, processed and compared."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from reflfield.capture.readers import open_capture
+from reflfield.config import HoldOut, Resources
+from reflfield.errors import ReflfieldError
+from reflfield.pipeline import run
+from reflfield.progress import report
+from reflfield.steps.job import Job
+from reflfield.steps.options import PipelineOptions
+
+SCENE = "demo_vase"
+HELD_OUT = HoldOut(views=2, lights=2)
+
+
+def run_demo(out: Path, workers: int) -> Job:
+    """Simulate the shipped scene into `out`/capture and process it into `out`.
+
+    Parameters
+    ----------
+    out : Path
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    Job
+
+    Raises
+    ------
+    ReflfieldError
+        If the simulation fails; its own message is passed on.
+    """
+    capture = out / "capture"
+    if not (capture / "capture.json").is_file():
+        simulate(capture, workers)
+    return run(
+        open_capture(capture),
+        out,
+        PipelineOptions(),
+        hold_out=HELD_OUT,
+        resources=Resources(workers=workers),
+    )
+
+
+def simulate(capture: Path, workers: int) -> None:
+    """Run the simulator as a process of its own: the two share nothing but files."""
+    capture.parent.mkdir(parents=True, exist_ok=True)
+    report("simulating the dome", 0, 1)
+    command = [simulator(), "render", SCENE, "-o", str(capture), "--workers", str(workers)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise ReflfieldError(
+            f"capture-sim: expected status 0, received {done.returncode}: {done.stderr.strip()}"
+        )
+    report("simulating the dome", 1, 1)
+
+
+def simulator() -> str:
+    """Path of the command ``capture-sim``, installed beside this one."""
+    beside = Path(sys.executable).with_name("capture-sim")
+    found = str(beside) if beside.is_file() else shutil.which("capture-sim")
+    if found is None:
+        raise ReflfieldError(
+            "capture-sim: expected beside reflfield, found none; install the distribution"
+        )
+    return found

@@ -1,0 +1,173 @@
+"""Photographs into texture space: one apparent BRDF sample per texel, view and light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.lights import Light
+from reflfield.capture.model import Capture
+from reflfield.checks import check_shape
+from reflfield.observations.store import VIEWS_PER_CHUNK, create_samples
+from reflfield.progress import report
+
+Floats = NDArray[np.float32]
+# Largest half float; a mirror-like peak beyond it is held there.
+HALF_MAX = 65504.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample_bilinear(images: Floats, pixels: NDArray[np.float64], out: Floats) -> None:
+    n_images, height, width, _ = images.shape
+    for i in range(len(pixels)):
+        # Pixel centres lie at half-integers; samples beyond the rim read the rim.
+        x = min(max(pixels[i, 0] - 0.5, 0.0), width - 1.0)
+        y = min(max(pixels[i, 1] - 0.5, 0.0), height - 1.0)
+        column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+        s, t = np.float32(x - column), np.float32(y - row)
+        right, below = min(column + 1, width - 1), min(row + 1, height - 1)
+        for j in range(n_images):
+            for c in range(3):
+                upper = (1 - s) * images[j, row, column, c] + s * images[j, row, right, c]
+                lower = (1 - s) * images[j, below, column, c] + s * images[j, below, right, c]
+                out[i, j, c] = (1 - t) * upper + t * lower
+
+
+def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
+    """Values of images at pixel positions.
+
+    Parameters
+    ----------
+    images : (n_images, h, w, 3) float32
+        Linear radiance.
+    pixels : (n, 2) float64
+        x and y; the centre of the top-left pixel is (0.5, 0.5).
+
+    Returns
+    -------
+    (n, n_images, 3) float32
+
+    Raises
+    ------
+    ShapeError
+        If a shape is wrong.
+
+    Examples
+    --------
+    >>> ramp = np.zeros((1, 1, 3, 3), np.float32)
+    >>> ramp[0, 0] = [[0.0], [1.0], [2.0]]
+    >>> float(sample_bilinear(ramp, np.array([[1.25, 0.5]]))[0, 0, 0])
+    0.75
+    """
+    check_shape("images", images, (None, None, None, 3))
+    check_shape("pixels", pixels, (None, 2))
+    out = np.zeros((len(pixels), len(images), 3), np.float32)
+    _sample_bilinear(
+        np.ascontiguousarray(images, np.float32), np.ascontiguousarray(pixels, np.float64), out
+    )
+    return out
+
+
+def facing_irradiance(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> Floats:
+    """Irradiance (n, n_lights, 3) that a surface facing each light gets; 1 if unknown."""
+    points = np.asarray(positions, np.float64)
+    return np.stack([light.irradiance(points) for light in lights], axis=1).astype(np.float32)
+
+
+def project_photographs(
+    capture: Capture,
+    positions: NDArray[np.floating],
+    visible: NDArray[np.bool_],
+    folder: Path,
+) -> None:
+    """Write the samples of all texels: radiance divided by the light's irradiance.
+
+    Parameters
+    ----------
+    capture : Capture
+        Photographs, cameras and lights.
+    positions : (n_texels, 3) float
+        Points of the surface, metres.
+    visible : (n_texels, n_views) bool
+        True where the camera sees the texel; other samples stay zero.
+    folder : Path
+        Store to create.
+
+    Raises
+    ------
+    CaptureError
+        If a photograph cannot be read.
+    ShapeError
+        If shapes disagree.
+
+    Notes
+    -----
+    Every photograph is read once. A chunk's worth of views is held at a time:
+    ``VIEWS_PER_CHUNK * n_texels * n_lights * 6`` bytes.
+    """
+    check_shape("positions", positions, (None, 3))
+    check_shape("visible", visible, (len(positions), capture.n_views))
+    group = _views_at_once(len(positions), capture.n_lights)
+    store = create_samples(folder, len(positions), capture.n_views, capture.n_lights, group)
+    points = np.asarray(positions, np.float64)
+    report("projecting photographs", 0, capture.n_views)
+    for first in range(0, capture.n_views, group):
+        views = range(first, min(first + group, capture.n_views))
+        block = np.zeros((len(points), len(views), capture.n_lights, 3), np.float16)
+        for i, view in enumerate(views):
+            seen = np.flatnonzero(visible[:, view])
+            for lights, values in _view_samples(capture, view, points[seen]):
+                block[seen[:, None], i, lights] = values
+            report("projecting photographs", view + 1, capture.n_views)
+        store[:, views.start : views.stop] = block
+
+
+def _views_at_once(n_texels: int, n_lights: int) -> int:
+    """Views whose samples are held together: a chunk's, fewer if they pass 512 MB."""
+    fits = (512 << 20) // max(n_texels * n_lights * 6, 1)
+    return int(min(max(fits, 1), VIEWS_PER_CHUNK))
+
+
+def _view_samples(
+    capture: Capture, view: int, points: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float16]]]:
+    """Samples of one view, some lights at a time: (lights, (n_points, n, 3))."""
+    pixels, _ = capture.cameras[view].project(points)
+    photographed = np.flatnonzero(capture.photograph_index[view] >= 0)
+    for lights in np.array_split(photographed, max(1, -(-len(photographed) // 32))):
+        if not len(lights):
+            continue
+        indices = capture.photograph_index[view, lights]
+        images = np.stack([capture.read_photograph(int(i)) for i in indices])
+        irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
+        # A light may have no blue, a spot may miss a texel: nothing is learned there.
+        lit = irradiance > 0
+        values = sample_bilinear(images, pixels) / np.where(lit, irradiance, 1.0)
+        values = np.clip(np.where(lit, values, 0.0), -HALF_MAX, HALF_MAX)
+        yield lights, values.astype(np.float16)
+
+
+def directions_of(
+    capture: Capture, positions: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unit directions from each texel to all cameras and all lights, world frame.
+
+    Returns
+    -------
+    views : (n, n_views, 3) float32
+    lights : (n, n_lights, 3) float32
+        Of an unknown light, world +Z: its direction does not enter.
+    """
+    points = np.asarray(positions, np.float64)
+    views = np.stack([camera.view_directions(points) for camera in capture.cameras], axis=1)
+    lights = np.stack([light.directions(points) for light in capture.lights], axis=1)
+    return views.astype(np.float32), lights.astype(np.float32)
+
+
+def pairs_photographed(capture: Capture) -> NDArray[np.bool_]:
+    """(n_views, n_lights) True where a photograph exists."""
+    return capture.photograph_index >= 0

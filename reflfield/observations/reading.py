@@ -1,0 +1,129 @@
+"""Texels of the store in a chosen frame: as samples with taps, or resampled onto nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.model import Capture
+from reflfield.observations.projection import directions_of
+from reflfield.observations.resampling import (
+    Nodes,
+    ResamplingOptions,
+    RootedSamples,
+    TexelSamples,
+    resample,
+    rooted_samples,
+    side_for,
+)
+from reflfield.observations.store import ObservationStore
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+
+def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
+    """Sides of the view and light grids of a capture.
+
+    A single view or light, and light that nobody measured, does not vary: side 1.
+    """
+    n_lights = capture.n_lights if capture.lights_known else 1
+    view = 1 if capture.n_views == 1 else options.view_side or side_for(capture.n_views)
+    light = 1 if n_lights == 1 else options.light_side or side_for(n_lights)
+    return view, light
+
+
+@dataclass(frozen=True, eq=False)
+class TexelReader:
+    """Samples of any texels, in frames that the caller chooses.
+
+    Parameters
+    ----------
+    store : ObservationStore
+        Samples and what is observed.
+    capture : Capture
+        Cameras and lights, in the order of the store.
+    positions : (n_texels, 3) float
+        Metres.
+    local_from_world : (n_texels, 3, 3) float32
+        Frames to read in.
+    sides : (int, int)
+        Sides of the view and light grids.
+    options : ResamplingOptions
+    """
+
+    store: ObservationStore
+    capture: Capture
+    positions: NDArray[np.floating]
+    local_from_world: Floats
+    sides: tuple[int, int]
+    options: ResamplingOptions
+
+    @property
+    def n_texels(self) -> int:
+        """Number of texels."""
+        return self.store.n_texels
+
+    @property
+    def n_pairs(self) -> int:
+        """Pairs of a view node and a light node."""
+        return self.sides[0] ** 2 * self.sides[1] ** 2
+
+    @property
+    def sample_bytes_per_texel(self) -> int:
+        """Memory of one texel's samples in the domain, with taps."""
+        n_views, n_lights = self.capture.n_views, self.capture.n_lights
+        return 2 * 12 * n_views * n_lights + 80 * (n_views + n_lights)
+
+    def rotated(self, local_from_world: Floats) -> TexelReader:
+        """Return a reader of the same samples in other frames."""
+        return replace(self, local_from_world=local_from_world)
+
+    def rooted(self, texels: Indices) -> RootedSamples:
+        """Samples (in the domain), taps and weights of some texels."""
+        views, lights = directions_of(self.capture, self.positions[texels])
+        observed = self.store.observed
+        samples = TexelSamples(
+            samples=self.store.read(texels),
+            views=views,
+            lights=lights,
+            view_seen=observed.views[texels],
+            light_seen=observed.lights[texels],
+            pairs=observed.pairs,
+        )
+        frames = np.ascontiguousarray(self.local_from_world[texels], np.float32)
+        return rooted_samples(samples, frames, self.sides, self.options.domain)
+
+    def nodes(self, texels: Indices) -> Nodes:
+        """Texels resampled onto the nodes of their frames."""
+        return resample(self.rooted(texels), self.sides, self.options.smoothness)
+
+
+@dataclass(frozen=True, eq=False)
+class NodeColumns:
+    """Resampled texels as columns of a matrix: rows are (pair of nodes, channel).
+
+    Has the interface of `factorization.ColumnSource`; columns are the texels named.
+    """
+
+    reader: TexelReader
+    texels: Indices
+    run_length: int = 256
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.reader.n_pairs * 3, len(self.texels)
+
+    def read(self, columns: Indices) -> tuple[Floats, Floats]:
+        """Values (n_rows, k) and weights (n_rows // 3, k) of some columns."""
+        chosen = self.texels[columns]
+        order = np.argsort(chosen)
+        nodes = self.reader.nodes(chosen[order])
+        back = np.argsort(order)
+        k = len(chosen)
+        values = nodes.values.reshape(k, -1)[back].T
+        weights = nodes.weights.reshape(k, -1)[back].T
+        return values, weights

@@ -1,0 +1,186 @@
+"""Stage that compares the field with photographs, and with the truth where there is one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reflfield.capture.model import Capture
+from reflfield.capture.readers import open_capture
+from reflfield.comparison.heldout import RelitPairs, compare_with_photographs
+from reflfield.comparison.metrics import Comparison, compare_frames
+from reflfield.comparison.truth import (
+    CompletionError,
+    FrameErrors,
+    HullDistance,
+    Truth,
+    completion_error,
+    frame_errors,
+    hull_distance,
+    open_truth,
+    surface_points,
+)
+from reflfield.field.file import open_field
+from reflfield.field.model import ReflectanceField
+from reflfield.observations.resampling import (
+    apply_both,
+    direction_taps,
+    interpolation_matrices,
+    local_directions,
+    unroot,
+)
+from reflfield.sphere.hemisphere import softened_cosine
+from reflfield.steps.job import Job
+
+# Texels farther from a true surface point than this many texel spacings see another part.
+MATCH_SPACINGS = 2.0
+
+
+def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
+    """Relight held-out frames and measure them; without any, say so."""
+    field = open_field(job.stages.root / "compression" / "field.rfld")
+    options = replace(job.options.relighting, workers=job.resources.workers)
+    counts: dict[str, Any] = {"frames": 0}
+    for name, frames in frame_sets(job).items():
+        comparison, _ = compare_with_photographs(field, frames, folder / name, options)
+        (folder / f"{name}.json").write_text(comparison.to_json())
+        counts["frames"] += len(frames.photographs)
+        counts[f"{name} PSNR, dB"] = comparison.mean["psnr_ldr"]
+    return counts
+
+
+def frame_sets(job: Job) -> dict[str, Capture]:
+    """Held-out photographs, and the unseen frames that a simulated capture brings."""
+    sets: dict[str, Capture] = {}
+    if job.held_frames.photographs:
+        sets["heldout"] = job.held_frames
+    truth = open_truth(job.capture.root)
+    frames = truth.heldout() if truth else None
+    if frames is not None:
+        sets["truth"] = open_capture(frames)
+    return sets
+
+
+def relit_pairs(job: Job) -> dict[str, RelitPairs]:
+    """What the comparison stage has relit."""
+    root = job.stages.root / "comparison"
+    return {name: RelitPairs(frames, root / name) for name, frames in frame_sets(job).items()}
+
+
+def stored_comparison(job: Job, name: str) -> dict[str, Any] | None:
+    """Metrics that the comparison stage has written."""
+    path = job.stages.root / "comparison" / f"{name}.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+# --- truth of simulated captures ----------------------------------------------------------
+
+
+def hull_score(job: Job, truth: Truth) -> HullDistance:
+    """Distance of the hull to the true surface, also in voxels of the hull's grid."""
+    details = json.loads((job.stages.root / "hull" / "hull.json").read_text())
+    mesh = job.hull_mesh
+    return hull_distance(
+        (mesh.vertices, mesh.faces), truth.mesh(), voxel=details.get("spacing")
+    )
+
+
+def frame_scores(
+    job: Job, truth: Truth, field: ReflectanceField
+) -> tuple[FrameErrors, FrameErrors] | None:
+    """Angles of the recovered and of the base frames to the true shading frames."""
+    cameras = [c.id for c in job.training.cameras if truth.has_view(c.id)]
+    if not cameras:
+        return None
+    surface = surface_points([truth.view(c) for c in cameras])
+    seen = job.seen_texels
+    reach = MATCH_SPACINGS * job.texels.spacing
+    position = job.texels.position[seen]
+    return (
+        frame_errors(position, field.local_from_world[seen], surface, reach),
+        frame_errors(position, field.base_from_world[seen], surface, reach),
+    )
+
+
+def completion_score(job: Job, truth: Truth) -> CompletionError | None:
+    """Error of the completed nodes against true apparent BRDFs, seen and unseen.
+
+    At every surface point whose full apparent BRDF the truth holds, the nearest texel's
+    completed function is evaluated for all its directions.
+    """
+    points = truth.samples()
+    if points is None or not job.training.lights_known:
+        return None
+    return _completion_at(job, points)
+
+
+def _completion_at(job: Job, points: dict[str, NDArray[Any]]) -> CompletionError | None:
+    seen = job.seen_texels
+    distance, nearest = cKDTree(job.texels.position[seen]).query(points["position"])
+    close = np.flatnonzero(distance < MATCH_SPACINGS * job.texels.spacing)
+    if not len(close):
+        return None
+    texels = seen[nearest[close]]
+    completed = completed_samples(job, texels, points["views"][close], points["lights"][close])
+    # Shadows are traced when rendering; what a shadowed sample would be is not asked.
+    lit = points["light_visible"][close][:, None, :]
+    above = (points["views"][close] * points["frame"][close][:, None, 2]).sum(axis=2) > 0
+    asked = np.broadcast_to(lit & above[:, :, None], completed.shape[:3])
+    used = np.zeros(asked.shape, bool)
+    training = np.ix_(
+        np.arange(len(close)),
+        np.setdiff1d(np.arange(job.capture.n_views), job.held_views),
+        np.setdiff1d(np.arange(job.capture.n_lights), job.held_lights),
+    )
+    measured = job.observed
+    used[training] = (
+        measured.views[texels][:, :, None]
+        & measured.lights[texels][:, None, :]
+        & measured.pairs[None]
+    )
+    return completion_error(completed[asked], points["samples"][close][asked], used[asked])
+
+
+def completed_samples(
+    job: Job, texels: NDArray[np.intp], views: NDArray[Any], lights: NDArray[Any]
+) -> NDArray[np.float32]:
+    """Samples of completed texels for directions of the world.
+
+    Parameters
+    ----------
+    job : Job
+        With its completion stage done.
+    texels : (n,) int
+    views, lights : (n, k, 3) float
+        Unit vectors.
+
+    Returns
+    -------
+    (n, n_views, n_lights, 3) float32
+        1/sr, cosine included, without cast shadows.
+    """
+    stored = job.result("completion", "completion.npz")
+    sides, domain = job.sides, job.options.resampling.domain
+    columns = stored["mean"] + stored["coefficients"][texels] @ stored["basis"].T
+    nodes = columns.reshape(len(texels), sides[0] ** 2, sides[1] ** 2, 3)
+    frames = job.texels.local_from_world[texels]
+    local = [local_directions(frames, d.astype(np.float32)) for d in (views, lights)]
+    at_views, at_lights = (
+        interpolation_matrices(direction_taps(d, side), side)
+        for d, side in zip(local, sides, strict=True)
+    )
+    values = np.maximum(unroot(apply_both(at_views, at_lights, nodes), domain), 0)
+    cosine = softened_cosine(local[1][..., 2]) if sides[1] > 1 else np.ones(lights.shape[:2])
+    return (values * cosine[:, None, :, None]).astype(np.float32)
+
+
+def comparison_of(job: Job, name: str) -> Comparison | None:
+    """Metrics of one set, measured again from the stored pictures."""
+    pairs = relit_pairs(job).get(name)
+    return compare_frames(pairs) if pairs is not None and len(pairs) else None

@@ -1,0 +1,212 @@
+"""One run of the pipeline: what it works on, and what its stages have left on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.model import PLANE, Capture
+from reflfield.config import HoldOut, Resources
+from reflfield.errors import InputError
+from reflfield.geometry.atlas import Atlas
+from reflfield.geometry.mesh import Mesh, read_ply
+from reflfield.geometry.texels import TexelTable, texel_table
+from reflfield.observations.projection import pairs_photographed
+from reflfield.observations.reading import TexelReader, grid_sides
+from reflfield.observations.store import ObservationStore, Observed
+from reflfield.stages import StageFolder
+from reflfield.steps.options import PipelineOptions
+
+# Held-out frames are rendered and shown: more than this many say nothing new.
+MOST_HELD_FRAMES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Capture, options and results so far.
+
+    Parameters
+    ----------
+    capture : Capture
+        With the photographs that are held out.
+    out : Path
+        Folder of all results.
+    options : PipelineOptions
+    hold_out : HoldOut
+    resources : Resources
+    redo : set of str
+        Stages to compute again.
+    """
+
+    capture: Capture
+    out: Path
+    options: PipelineOptions
+    hold_out: HoldOut = field(default_factory=HoldOut)
+    resources: Resources = field(default_factory=Resources)
+    redo: frozenset[str] = frozenset()
+
+    @cached_property
+    def stages(self) -> StageFolder:
+        """Folders of the stages."""
+        return StageFolder(self.out / "stages", set(self.redo))
+
+    @cached_property
+    def held_views(self) -> NDArray[np.intp]:
+        """Views kept for comparison."""
+        return evenly_spread(self.hold_out.views, self.capture.n_views, "views")
+
+    @cached_property
+    def held_lights(self) -> NDArray[np.intp]:
+        """Lights kept for comparison."""
+        return evenly_spread(self.hold_out.lights, self.capture.n_lights, "lights")
+
+    @cached_property
+    def training(self) -> Capture:
+        """The capture without what is held out."""
+        views = np.setdiff1d(np.arange(self.capture.n_views), self.held_views)
+        lights = np.setdiff1d(np.arange(self.capture.n_lights), self.held_lights)
+        return self.capture.subset(views, lights)
+
+    @cached_property
+    def held_frames(self) -> Capture:
+        """Held-out photographs: of held views under held lights, where both are held.
+
+        With views alone (or lights alone) held out, those views under all lights (those
+        lights from all views), thinned evenly to `MOST_HELD_FRAMES`.
+        """
+        views = self.held_views if len(self.held_views) else np.arange(self.capture.n_views)
+        lights = self.held_lights if len(self.held_lights) else np.arange(self.capture.n_lights)
+        if not len(self.held_views) and not len(self.held_lights):
+            views = views[:0]
+        frames = self.capture.subset(views, lights)
+        n = len(frames.photographs)
+        chosen = np.unique(np.linspace(0, n - 1, min(n, MOST_HELD_FRAMES)).astype(int))
+        return replace(frames, photographs=tuple(frames.photographs[i] for i in chosen))
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether the base surface is the image plane of one view."""
+        return self.capture.base_geometry == PLANE
+
+    @cached_property
+    def view_silhouettes(self) -> list[NDArray[np.float32]]:
+        """Coverage of every training view."""
+        stored = load_arrays(self.stages.root / "silhouettes" / "silhouettes.npz")
+        return [
+            stored[f"view{i}"].astype(np.float32) / np.float32(255) for i in range(len(stored))
+        ]
+
+    @cached_property
+    def hull_mesh(self) -> Mesh:
+        """Base surface."""
+        return read_ply(self.stages.root / "hull" / "hull.ply")
+
+    @cached_property
+    def surface_atlas(self) -> Atlas:
+        """Base surface with texture coordinates."""
+        stored = load_arrays(self.stages.root / "atlas" / "atlas.npz")
+        height, width = (int(n) for n in stored.pop("size"))
+        return Atlas(**stored, height=height, width=width)
+
+    @cached_property
+    def texels(self) -> TexelTable:
+        """What each texel stands for."""
+        return texel_table(self.surface_atlas)
+
+    @cached_property
+    def view_seen(self) -> NDArray[np.bool_]:
+        """(n_texels, n_views) True where the camera sees the texel."""
+        return load_arrays(self.stages.root / "visibility" / "visibility.npz")["views"]
+
+    @cached_property
+    def light_seen(self) -> NDArray[np.bool_]:
+        """(n_texels, n_lights) True where the light reaches the texel."""
+        return load_arrays(self.stages.root / "visibility" / "visibility.npz")["lights"]
+
+    @property
+    def visibility_kind(self) -> str:
+        """Whether shadows are "kept" in the data or "factored" out.
+
+        A flat base surface and unknown light cast no shadow that could be traced.
+        """
+        if self.is_plane or not self.capture.lights_known:
+            return "kept"
+        return self.options.resampling.visibility
+
+    @cached_property
+    def observed(self) -> Observed:
+        """Which samples count."""
+        factored = self.visibility_kind == "factored"
+        lights = self.light_seen if factored else np.ones_like(self.light_seen)
+        return Observed(self.view_seen, lights, pairs_photographed(self.training))
+
+    @cached_property
+    def sides(self) -> tuple[int, int]:
+        """Sides of the view and light grids."""
+        return grid_sides(self.training, self.options.resampling)
+
+    @cached_property
+    def base_reader(self) -> TexelReader:
+        """Samples in the base frames."""
+        return TexelReader(
+            store=ObservationStore(self.stages.root / "observations", self.observed),
+            capture=self.training,
+            positions=self.texels.position,
+            local_from_world=self.texels.local_from_world,
+            sides=self.sides,
+            options=self.options.resampling,
+        )
+
+    @cached_property
+    def seen_texels(self) -> NDArray[np.intp]:
+        """Texels with at least one sample."""
+        pairs = self.observed.views.astype(np.float32) @ self.observed.pairs.astype(np.float32)
+        return np.flatnonzero((pairs * self.observed.lights).any(axis=1))
+
+    def training_texels(self, most: int) -> NDArray[np.intp]:
+        """At most so many seen texels, drawn at random, ascending."""
+        seen = self.seen_texels
+        if not len(seen):
+            raise InputError(
+                "capture: expected texels that a camera sees under a light, found none; check "
+                "the calibration and the positions of the lights"
+            )
+        if len(seen) <= most:
+            return seen
+        rng = np.random.default_rng(self.options.seed)
+        return np.sort(rng.choice(seen, most, replace=False))
+
+    def result(self, stage: str, name: str) -> dict[str, NDArray[Any]]:
+        """Arrays that a stage has written."""
+        return load_arrays(self.stages.root / stage / name)
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of an npz file; nothing is unpickled."""
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def evenly_spread(count: int, total: int, what: str) -> NDArray[np.intp]:
+    """Indices of `count` of `total` things, evenly spread.
+
+    Raises
+    ------
+    InputError
+        If none would be left.
+
+    Examples
+    --------
+    >>> evenly_spread(2, 32, "views")
+    array([ 8, 24])
+    """
+    if count and count >= total:
+        raise InputError(
+            f"--hold-out: expected fewer than the {total} {what}, received {count}"
+        )
+    return ((np.arange(count) + 0.5) * total / max(count, 1)).astype(np.intp)

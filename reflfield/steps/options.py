@@ -1,0 +1,123 @@
+"""Options of the whole pipeline: one frozen dataclass for each stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from reflfield.errors import InputError
+from reflfield.field.compression import CompressionOptions
+from reflfield.geometry.atlas import AtlasOptions
+from reflfield.geometry.hull import HullOptions
+from reflfield.geometry.visibility import VisibilityOptions
+from reflfield.observations.resampling import ResamplingOptions
+from reflfield.relighting.renderer import RenderOptions
+
+
+@dataclass(frozen=True)
+class TextureOptions:
+    """Density of the texels.
+
+    Parameters
+    ----------
+    texels_per_pixel : float
+        Texels along a pixel's footprint on the surface, where `atlas.resolution` is 0.
+    largest : int
+        Largest side of a texture chosen so.
+    """
+
+    texels_per_pixel: float = 1.6
+    largest: int = 512
+
+    def __post_init__(self) -> None:
+        if not self.texels_per_pixel > 0:
+            raise InputError(
+                f"texels_per_pixel: expected > 0, received {self.texels_per_pixel}"
+            )
+
+
+@dataclass(frozen=True)
+class CompletionOptions:
+    """How missing samples are filled before alignment.
+
+    Parameters
+    ----------
+    rank : int
+        Of the matrix of resampled texels.
+    passes : int
+        Over the training texels.
+    method : {"map", "brand"}
+        Block recursive least squares with a Gaussian prior, or Brand's online SVD with
+        imputation as in the paper.
+    training_texels : int
+        Texels, drawn at random, that shape the basis; all are completed in it.
+    """
+
+    rank: int = 12
+    passes: int = 4
+    method: Literal["map", "brand"] = "map"
+    training_texels: int = 8192
+
+    def __post_init__(self) -> None:
+        for name in ("rank", "passes", "training_texels"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
+        if self.method not in ("map", "brand"):
+            raise InputError(f"method: expected 'map' or 'brand', received {self.method!r}")
+
+
+@dataclass(frozen=True)
+class AlignmentOptions:
+    """How local frames are found.
+
+    Parameters
+    ----------
+    enabled : bool
+        False keeps the base frames: what the paper compares with.
+    band_limit : int
+        Degrees below it are correlated; lowered to what the grids support.
+    iterations : int
+        Rounds of expectation maximisation.
+    n_clusters : int
+        Materials told apart by the orientation-invariant distance.
+    refine : bool
+        Refine the frames on the samples after the harmonic search.
+    max_tilt_deg : float
+        Largest tilt of a normal from the base surface's.
+    least_margin : float
+        Texels whose rotation is less determined than this keep their base frame.
+    """
+
+    enabled: bool = True
+    band_limit: int = 8
+    iterations: int = 4
+    n_clusters: int = 4
+    refine: bool = False
+    max_tilt_deg: float = 45.0
+    least_margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_tilt_deg <= 180:
+            raise InputError(f"max_tilt_deg: expected (0, 180], received {self.max_tilt_deg}")
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """Options of all stages; see each dataclass.
+
+    Parameters
+    ----------
+    seed : int
+        Of every random choice.
+    """
+
+    hull: HullOptions = field(default_factory=HullOptions)
+    texture: TextureOptions = field(default_factory=TextureOptions)
+    atlas: AtlasOptions = field(default_factory=lambda: AtlasOptions(resolution=0))
+    visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
+    resampling: ResamplingOptions = field(default_factory=ResamplingOptions)
+    completion: CompletionOptions = field(default_factory=CompletionOptions)
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
+    compression: CompressionOptions = field(default_factory=CompressionOptions)
+    relighting: RenderOptions = field(default_factory=RenderOptions)
+    seed: int = 0

@@ -1,0 +1,277 @@
+"""What a run leaves beside the stages' folders: field, pictures, meshes, report, records."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.images import encode_srgb, write_exr
+from reflfield.comparison import sections
+from reflfield.comparison.heldout import mean_sample
+from reflfield.comparison.metrics import Comparison
+from reflfield.comparison.pictures import texture
+from reflfield.comparison.report import ReportContent, Section, write_report
+from reflfield.comparison.truth import open_truth
+from reflfield.config import write_toml
+from reflfield.export.gltf import write_glb
+from reflfield.field.file import describe, open_field
+from reflfield.field.model import ReflectanceField
+from reflfield.geometry.visibility import RayScene
+from reflfield.stages import plain, replacing, versions
+from reflfield.steps import evaluation
+from reflfield.steps.job import Job
+
+# Texels whose raw samples are averaged together for the mean texture.
+TEXELS_AT_ONCE = 1024
+
+
+def publish(job: Job) -> None:
+    """Copy what the stages have made to its place in the output folder.
+
+    Every file is replaced whole. Files of stages that have not run are not touched.
+    """
+    stages = job.stages.root
+    done = {record.name for record in job.stages.records}
+    files = {
+        "hull": {"hull/hull.ply": "hull.ply"},
+        "compression": {"compression/field.rfld": "field.rfld"},
+        "report": {
+            name: Path(name).name for name in ("report/atlas.glb", "report/normals.exr",
+                                               "report/tangents.exr", "report/metrics.json")
+        } | {"report/index.html": "report/index.html"},
+    }  # fmt: skip
+    for stage, pairs in files.items():
+        for source, target in pairs.items():
+            if stage in done and (stages / source).is_file():
+                (job.out / target).parent.mkdir(parents=True, exist_ok=True)
+                with replacing(job.out / target) as partial:
+                    shutil.copyfile(stages / source, partial)
+    with replacing(job.out / "timings.json") as partial:
+        partial.write_text(json.dumps(timings(job), indent=1) + "\n")
+    with replacing(job.out / "options.toml") as partial:
+        write_toml(partial, job.options)
+
+
+def timings(job: Job) -> dict[str, Any]:
+    """Time, memory, sizes and counts of every stage, with versions."""
+    records = [plain(asdict(record)) for record in job.stages.records]
+    return {
+        "stages": records,
+        "seconds": sum(record["seconds"] for record in records),
+        "peak_bytes": max((record["peak_bytes"] for record in records), default=0),
+        "workers": job.resources.workers,
+        "max_memory": job.resources.max_memory,
+        "versions": versions(),
+    }
+
+
+def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
+    """Pictures in texture space, the mesh with its mean texture, metrics and the page."""
+    field = open_field(job.stages.root / "compression" / "field.rfld")
+    _write_maps(job, field, folder)
+    average = average_samples(job)
+    _write_mesh(job, average, folder)
+    metrics = evaluation.stored_comparison(job, "heldout") or evaluation.stored_comparison(
+        job, "truth"
+    )
+    (folder / "metrics.json").write_text(
+        json.dumps(metrics or {"frames": [], "mean": {}}, indent=2) + "\n"
+    )
+    content = report_content(job, field, average)
+    write_report(folder / "index.html", content)
+    return {"sections": len(content.sections)}
+
+
+def _write_maps(job: Job, field: ReflectanceField, folder: Path) -> None:
+    texel_of_pixel = job.texels.texel_of_pixel
+    frames = field.local_from_world
+    for name, row in (("normals", 2), ("tangents", 0)):
+        image = texture(frames[:, row], texel_of_pixel, nothing=0.0)
+        write_exr(folder / f"{name}.exr", image.astype(np.float32))
+
+
+def average_samples(job: Job) -> NDArray[np.float32]:
+    """Mean observed sample of every texel, (n_texels, 3); NaN where there is none."""
+    store = job.base_reader.store
+    observed = store.observed
+    averages = np.full((store.n_texels, 3), np.nan, np.float32)
+    for first in range(0, store.n_texels, TEXELS_AT_ONCE):
+        part = slice(first, min(first + TEXELS_AT_ONCE, store.n_texels))
+        seen = observed.views[part, :, None] & observed.lights[part, None, :] & observed.pairs
+        averages[part] = mean_sample(store.read(part), seen)
+    return averages
+
+
+def _write_mesh(job: Job, average: NDArray[np.float32], folder: Path) -> None:
+    """Mesh with UVs and the mean texture, bright enough to look at."""
+    known = np.nan_to_num(average)
+    white = np.percentile(known.max(axis=1), 99) or 1.0
+    texels = job.texels.texel_of_pixel
+    picture = encode_srgb(np.clip(known / white, 0, 1))[np.maximum(texels, 0)]
+    picture = np.where(texels[..., None] >= 0, picture, 0)
+    write_glb(folder / "atlas.glb", job.surface_atlas, np.rint(picture * 255).astype(np.uint8))
+
+
+# --- report -------------------------------------------------------------------------------
+
+
+def report_content(
+    job: Job, field: ReflectanceField, average: NDArray[np.float32]
+) -> ReportContent:
+    """All sections of the page, in the order of the stages."""
+    compared = {
+        name: evaluation.comparison_of(job, name) for name in evaluation.frame_sets(job)
+    }
+    main = compared.get("heldout") or compared.get("truth")
+    parts = [
+        *_frames_sections(job, compared),
+        *_surface_sections(job, field, average),
+        _alignment_section(job),
+        *_truth_sections(job, field, compared.get("truth")),
+        _compression_section(job),
+        sections.stages_section([_stage(record) for record in job.stages.records]),
+        sections.run_section(plain(job.options), versions()),
+    ]
+    counts = job.stages.records[-1] if job.stages.records else None
+    size = (job.stages.root / "compression" / "field.rfld").stat().st_size
+    return ReportContent(
+        title=job.capture.name,
+        subtitle=_subtitle(job),
+        key_numbers=sections.key_numbers(
+            main,
+            file_bytes=size,
+            raw_bytes=raw_bytes(job),
+            seconds=sum(record.seconds for record in job.stages.records),
+        ),
+        sections=tuple(parts),
+        warnings=tuple(warnings_of(job)),
+        footer="" if counts is None else f"Stages in {job.stages.root.name}/",
+    )
+
+
+def _subtitle(job: Job) -> str:
+    training = job.training
+    return (
+        f"{training.n_views} views, {training.n_lights} lights, {len(training.photographs)} "
+        f"photographs; {len(job.held_views)} views and {len(job.held_lights)} lights held out; "
+        f"{job.base_reader.n_texels} texels"
+    )
+
+
+def raw_bytes(job: Job) -> int:
+    """Samples of the capture as half floats, unobserved ones included."""
+    return int(np.prod(job.observed.views.shape)) * job.training.n_lights * 3 * 2
+
+
+def warnings_of(job: Job) -> Iterator[str]:
+    """What a user should look at first."""
+    unseen = job.base_reader.n_texels - len(job.seen_texels)
+    if unseen:
+        share = unseen / job.base_reader.n_texels
+        yield (
+            f"{unseen} of {job.base_reader.n_texels} texels ({share:.0%}) have no sample; they "
+            "repeat the nearest texel that has."
+        )
+    missing = int((~job.observed.pairs).sum())
+    if missing:
+        total = job.observed.pairs.size
+        yield f"{missing} of {total} pairs of view and light have no photograph."
+
+
+def _surface_sections(
+    job: Job, field: ReflectanceField, average: NDArray[np.float32]
+) -> Iterator[Section]:
+    texels = job.texels
+    given = any(path is not None for path in job.training.silhouettes)
+    yield sections.silhouettes_section(
+        _silhouette_views(job),
+        origin="given with the capture" if given else "made from the photographs",
+    )
+    yield sections.atlas_section(
+        texels.texel_of_pixel,
+        texels.chart,
+        average,
+        {"charts": int(texels.chart.max()) + 1, "texels": len(texels)},
+    )
+    yield sections.coverage_section(
+        texels.texel_of_pixel, job.view_seen.sum(axis=1), job.observed.lights.sum(axis=1)
+    )
+    yield sections.normals_section(
+        texels.texel_of_pixel, field.local_from_world, field.base_from_world
+    )
+
+
+def _silhouette_views(job: Job) -> Iterator[sections.SilhouetteView]:
+    scene = RayScene(job.surface_atlas.mesh, threads=job.resources.workers)
+    for i, camera in enumerate(job.training.cameras):
+        photographs = job.training.photograph_index[i]
+        brightest = int(photographs[photographs >= 0][0])
+        row, column = np.indices((camera.height, camera.width))
+        pixels = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=1)
+        covered = np.isfinite(scene.pixel_depths(camera, pixels))
+        yield sections.SilhouetteView(
+            name=camera.id,
+            photograph=job.training.read_photograph(brightest),
+            silhouette=job.view_silhouettes[i],
+            hull_silhouette=covered.reshape(camera.height, camera.width).astype(np.float32),
+        )
+
+
+def _frames_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterator[Section]:
+    titles = {
+        "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
+        "truth": ("Unseen views and lights", "Simulated from cameras and lights off the rig."),
+    }
+    for name, pairs in evaluation.relit_pairs(job).items():
+        comparison = compared[name]
+        if comparison is not None:
+            title, intro = titles[name]
+            yield sections.frames_section(comparison, pairs, title=title, intro=intro)
+
+
+def _alignment_section(job: Job) -> Section:
+    stored = job.result("alignment", "alignment.npz")
+    return sections.alignment_section(stored["history"], stored["margin"][job.seen_texels])
+
+
+def _truth_sections(
+    job: Job, field: ReflectanceField, compared: Comparison | None
+) -> Iterator[Section]:
+    truth = open_truth(job.capture.root)
+    if truth is None:
+        return
+    frames = evaluation.frame_scores(job, truth, field)
+    yield sections.truth_section(
+        hull=None if job.is_plane else evaluation.hull_score(job, truth),
+        frames=frames[0] if frames else None,
+        base_frames=frames[1] if frames else None,
+        completion=evaluation.completion_score(job, truth),
+        comparison=compared,
+    )
+
+
+def _compression_section(job: Job) -> Section:
+    field = open_field(job.stages.root / "compression" / "field.rfld")
+    stored = job.result("compression", "model.npz")
+    parts = describe(field).stored_bytes
+    curves = {"completion": stored["spread"]} if "spread" in stored else None
+    return sections.compression_section(parts, raw_bytes(job), singular_values=curves)
+
+
+def _stage(record: Any) -> sections.StageRecord:
+    counts = {k: v for k, v in record.counts.items() if isinstance(v, int)}
+    return sections.StageRecord(
+        name=record.name,
+        seconds=record.seconds,
+        peak_bytes=record.peak_bytes,
+        outputs=counts,
+        size_bytes=record.size_bytes,
+        reused=record.reused,
+    )

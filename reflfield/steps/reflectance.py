@@ -1,0 +1,341 @@
+"""Stages that find the reflectance: observations, completion, alignment, compression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.alignment import Alignment, align
+from reflfield.factorization import Completion, complete
+from reflfield.factorization.inference import infer_coefficients
+from reflfield.field.compression import cluster_completed, fill_unobserved
+from reflfield.field.file import write_field
+from reflfield.field.fit import ClusteredModel, fit_samples
+from reflfield.field.model import (
+    BaseSurface,
+    FittedReflectance,
+    ReflectanceField,
+    build_field,
+)
+from reflfield.observations.projection import project_photographs
+from reflfield.observations.reading import NodeColumns, TexelReader
+from reflfield.observations.resampling import unroot
+from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
+from reflfield.sphere.projection import safe_band_limit
+from reflfield.stages import plain, versions
+from reflfield.steps.job import Job, load_arrays
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+# Rec.709 luminance: what alignment correlates.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+def write_observations(job: Job, folder: Path) -> dict[str, Any]:
+    """Apparent BRDF samples of all texels, on disk."""
+    project_photographs(job.training, job.texels.position, job.view_seen, folder)
+    store = job.base_reader.store
+    return {
+        "photographs": len(job.training.photographs),
+        "samples": int(np.prod(store.observed.views.shape)) * job.training.n_lights,
+        "samples observed": store.observed.count(),
+        "raw bytes": int(np.prod(store.observed.views.shape)) * job.training.n_lights * 6,
+    }
+
+
+def write_completion(job: Job, folder: Path) -> dict[str, Any]:
+    """Texels resampled in their base frames, and what was not observed of them filled."""
+    options = job.options.completion
+    chosen = job.training_texels(options.training_texels)
+    found, coefficients = completed(
+        job.base_reader,
+        chosen,
+        job.seen_texels,
+        rank=options.rank,
+        passes=options.passes,
+        method=options.method,
+        seed=job.options.seed,
+    )
+    write_completion_arrays(folder / "completion.npz", found, coefficients)
+    return {
+        "texels that shape the basis": len(chosen),
+        "texels completed": len(job.seen_texels),
+        "texels without samples": job.base_reader.n_texels - len(job.seen_texels),
+        "share of nodes observed": float(found.coverage.mean()),
+        "residual": float(found.residuals[-1]),
+    }
+
+
+def completed(
+    reader: TexelReader,
+    chosen: Indices,
+    seen: Indices,
+    *,
+    rank: int,
+    passes: int = 4,
+    method: Literal["map", "brand"] = "map",
+    seed: int = 0,
+) -> tuple[Completion, Floats]:
+    """Completion shaped by the chosen texels, and coefficients of all.
+
+    Returns
+    -------
+    completion : Completion
+    coefficients : (n_texels, rank) float32
+        Zero (the mean) for texels without samples.
+    """
+    columns = _InMemory.read_from(NodeColumns(reader, chosen))
+    found = complete(
+        columns,
+        rank=rank,
+        passes=passes,
+        method=method,
+        n_channels=3,
+        seed=seed,
+    )
+    coefficients = np.zeros((reader.n_texels, found.rank), np.float32)
+    coefficients[chosen] = found.coefficients
+    others = np.setdiff1d(seen, chosen)
+    if len(others):
+        coefficients[others], _ = infer_coefficients(
+            found, NodeColumns(reader, others), n_channels=3
+        )
+    return found, coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class _InMemory:
+    """Columns that several passes read, as halves."""
+
+    values: NDArray[np.float16]
+    weights: NDArray[np.float16]
+
+    @classmethod
+    def read_from(cls, source: NodeColumns) -> _InMemory:
+        rows, n = source.shape
+        values = np.zeros((n, rows), np.float16)
+        weights = np.zeros((n, rows // 3), np.float16)
+        for first in range(0, n, source.run_length):
+            part = np.arange(first, min(first + source.run_length, n))
+            block, share = source.read(part)
+            values[part], weights[part] = block.T, share.T
+        return cls(values, weights)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.values.shape[1], self.values.shape[0]
+
+    def read(self, columns: Indices) -> tuple[Floats, Floats]:
+        return (
+            self.values[columns].T.astype(np.float32),
+            self.weights[columns].T.astype(np.float32),
+        )
+
+
+def write_completion_arrays(path: Path, found: Completion, coefficients: Floats) -> None:
+    """Store what later stages need of a completion."""
+    np.savez(
+        path,
+        basis=found.basis.astype(np.float32),
+        mean=found.mean.astype(np.float32),
+        coefficients=coefficients,
+        noise=np.array(found.noise),
+        residuals=np.array(found.residuals),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CompletedLuminance:
+    """Completed texels as alignment correlates them: luminance, linear, with the cosine.
+
+    Parameters
+    ----------
+    mean, basis, coefficients : ndarray
+        Of the completion; coefficients of the texels to align.
+    sides : (int, int)
+        Sides of the grids.
+    domain : str
+    cosine : bool
+        Whether the light's cosine is to be multiplied back.
+    """
+
+    mean: Floats
+    basis: Floats
+    coefficients: Floats
+    sides: tuple[int, int]
+    domain: str
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(n_texels, n_view_nodes, n_light_nodes)."""
+        return len(self.coefficients), self.sides[0] ** 2, self.sides[1] ** 2
+
+    def read(self, rows: NDArray[np.int64]) -> Floats:
+        """Samples at the nodes, (k, n_view_nodes, n_light_nodes)."""
+        columns = self.mean + self.coefficients[rows] @ self.basis.T
+        nodes = columns.reshape(len(rows), *self.shape[1:], 3)
+        values = unroot(nodes, self.domain) @ LUMINANCE
+        if self.sides[1] > 1:
+            z = HemisphereGrid(self.sides[1]).directions[:, 2]
+            values = values * softened_cosine(z).astype(np.float32)
+        return np.maximum(values, 0).astype(np.float32)
+
+
+def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
+    """One local frame per texel."""
+    n = job.base_reader.n_texels
+    frames = np.tile(np.eye(3), (n, 1, 1))
+    arrays: dict[str, Any] = {
+        "cluster": np.zeros(n, np.int32),
+        "score": np.zeros(n),
+        "margin": np.zeros(n),
+        "history": np.zeros(0),
+    }
+    if job.options.alignment.enabled and max(job.sides) > 1:
+        found = aligned(job)
+        seen = job.seen_texels
+        keep = found.margin >= job.options.alignment.least_margin
+        frames[seen[keep]] = found.local_from_base[keep]
+        for name in ("cluster", "score", "margin"):
+            arrays[name][seen] = getattr(found, name)
+        arrays["history"] = found.history
+    np.savez(folder / "alignment.npz", local_from_base=frames, **arrays)
+    moved = np.degrees(np.arccos(np.clip(frames[:, 2, 2], -1, 1)))
+    return {
+        "texels aligned": len(job.seen_texels),
+        "mean tilt from the base normal, degrees": float(moved[job.seen_texels].mean()),
+        "rotation determined (margin > .01)": int((arrays["margin"] > 0.01).sum()),
+    }
+
+
+def aligned(job: Job) -> Alignment:
+    """Alignment of the completed texels that have samples."""
+    options = job.options.alignment
+    stored = job.result("completion", "completion.npz")
+    source = CompletedLuminance(
+        mean=stored["mean"],
+        basis=stored["basis"],
+        coefficients=stored["coefficients"][job.seen_texels],
+        sides=job.sides,
+        domain=job.options.resampling.domain,
+    )
+    view, light = (HemisphereGrid(side).directions for side in job.sides)
+    limits = tuple(_band_limit(options.band_limit, d) for d in (view, light))
+    return align(
+        source,
+        view,
+        light,
+        band_limit=(limits[0], limits[1]),
+        iterations=options.iterations,
+        n_clusters=options.n_clusters,
+        refine=options.refine,
+        seed=job.options.seed,
+        max_tilt=np.radians(options.max_tilt_deg),
+        n_threads=job.resources.workers,
+    )
+
+
+def _band_limit(wanted: int, directions: NDArray[np.float64]) -> int:
+    return min(wanted, safe_band_limit(int((directions[:, 2] > 0).sum())))
+
+
+def write_compression(job: Job, folder: Path) -> dict[str, Any]:
+    """Raw samples in the aligned frames -> clusters, mean, basis, coefficients -> field."""
+    stored = job.result("alignment", "alignment.npz")
+    frames = local_frames(job, stored["local_from_base"])
+    model = fitted_model(job, job.base_reader.rotated(frames))
+    made = field_of(job, model, frames)
+    write_field(folder / "field.rfld", made)
+    np.savez(folder / "model.npz", residuals=np.array(model.residuals))
+    size = (folder / "field.rfld").stat().st_size
+    raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
+    return {
+        "clusters": made.n_clusters,
+        "components": made.n_components,
+        "field bytes": size,
+        "raw bytes": raw,
+        "compression ratio": raw / size,
+        "residual in the domain": float(model.residuals[-1]) if model.residuals else None,
+    }
+
+
+def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
+    """Frames of the texels in the world, from their turns against the base frames."""
+    return (local_from_base @ job.texels.local_from_world).astype(np.float32)
+
+
+def fitted_model(job: Job, reader: TexelReader) -> ClusteredModel:
+    """Clusters, mean, basis and coefficients in the reader's frames."""
+    options = job.options.compression
+    seen = job.seen_texels
+    found, coefficients = completed(
+        reader,
+        job.training_texels(options.training_texels),
+        seen,
+        rank=options.rank,
+        seed=job.options.seed,
+    )
+    counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
+    model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)
+    n_samples = job.training.n_views * job.training.n_lights
+    if options.fits_samples(n_samples, reader.n_pairs):
+        model = fit_samples(
+            reader.rooted,
+            model,
+            seen,
+            reader.sample_bytes_per_texel,
+            options.samples,
+            workers=job.resources.workers,
+            seed=job.options.seed,
+        )
+    return fill_unobserved(model, job.texels.position, seen)
+
+
+def field_of(job: Job, model: ClusteredModel, frames: Floats) -> ReflectanceField:
+    """Quantise the model on the base surface into a field."""
+    atlas, texels = job.surface_atlas, job.texels
+    surface = BaseSurface(
+        positions=atlas.positions,
+        faces=atlas.faces,
+        uv=atlas.uv,
+        texel_of_pixel=texels.texel_of_pixel,
+        base_from_world=texels.local_from_world,
+    )
+    reflectance = FittedReflectance(
+        local_from_world=frames,
+        cluster=model.cluster,
+        coefficients=model.coefficients,
+        mean=model.mean,
+        basis=model.basis,
+        domain=job.options.resampling.domain,  # type: ignore[arg-type]
+    )
+    return build_field(
+        surface,
+        reflectance,
+        visibility=job.visibility_kind,  # type: ignore[arg-type]
+        light_model="known" if job.training.lights_known else "unknown",
+        metadata=field_metadata(job),
+        quantisation=job.options.compression.quantisation,
+    )
+
+
+def field_metadata(job: Job) -> dict[str, Any]:
+    """What a field says of its making."""
+    return {
+        "capture": job.capture.name,
+        "up": job.capture.up.tolist(),
+        "views": job.training.n_views,
+        "lights": job.training.n_lights,
+        "photographs": len(job.training.photographs),
+        "held_out": {"views": job.hold_out.views, "lights": job.hold_out.lights},
+        "options": plain(job.options),
+        "versions": versions(),
+    }
+
+
+__all__ = ["load_arrays"]
