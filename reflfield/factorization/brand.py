@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.errors import InputError
 from reflfield.factorization.online import OnlineSVD
 from reflfield.factorization.recursive import Fit, Model, floored, gram_of_samples, infer
 from reflfield.factorization.sources import Block, Columns, Reader, blocks_of, run_length
@@ -32,6 +33,11 @@ def fit_brand(reader: Reader, rank: int, passes: int, block: int) -> Fit:
     -------
     Fit
         Zero offset; the residuals are those before each update.
+
+    Raises
+    ------
+    InputError
+        If nothing was observed.
     """
     order = _by_coverage(reader, block)
     model: Model | None = None
@@ -51,6 +57,11 @@ def fit_brand(reader: Reader, rank: int, passes: int, block: int) -> Fit:
             weight += float(data.weights.sum()) * reader.n_channels
             if previous is None:
                 model = model_of(svd, reader.n_channels, squared / weight)
+        if weight == 0:
+            raise InputError(
+                "observed: expected at least one observed entry, received none; there is "
+                "nothing to complete from"
+            )
         model = model_of(svd, reader.n_channels, squared / weight)
         residuals.append(float(np.sqrt(squared / weight)))
     report("completion", len(order), len(order))

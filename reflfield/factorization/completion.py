@@ -40,6 +40,8 @@ from reflfield.progress import report
 STALLED_RATIO = 1.25
 # and the last pass left more than this share of the residual before it.
 SLOW_FALL = 0.9
+# While columns stream by, rows are solved again when so many times the columns were summed.
+SOLVING_GROWTH = 1.05
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,8 @@ def complete(
     centred : bool
         True: a mean column is fitted beside the `rank` basis vectors.
     block : int
-        Columns held in memory at once.
+        Columns held in memory at once. For a source with a ``run_length``, a multiple of
+        it: a chunk is then read once a pass.
     restarts : int
         How often to start again with another column order if the training residual
         does not settle.
@@ -273,15 +276,17 @@ def _fit_restarting(
 def one_pass(
     reader: Reader, model: Model, order: Columns, block: int, *, online: bool
 ) -> tuple[Model, RowStatistics]:
-    """Sum the statistics of all columns; `online` solves the rows after every block."""
+    """Sum the statistics of all columns; `online` solves the rows as columns come."""
     statistics = RowStatistics(model)
     gram = gram_of_samples(model.basis, model.n_channels)
+    solved_at = 0
     for done, columns in enumerate(blocks_of(order, block)):
         report("completion", done * block, len(order))
         data = reader.block(columns)
         counted = data.coverage >= LEAST_COVERAGE
         statistics.add(data, infer(model, data, gram), counted)
-        if online and counted.any():
+        if online and statistics.count > SOLVING_GROWTH * solved_at:
+            solved_at = statistics.count
             model = resolve_online(
                 with_moments(model, statistics), statistics, PSEUDO_OBSERVATIONS
             )

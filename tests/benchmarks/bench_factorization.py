@@ -114,9 +114,8 @@ def completion(pattern, sizes, limits):
     data = problem(pattern, rng, rank=RANK, **sizes)
     share = data.observed.mean()
     few = int((data.observed.sum(axis=1) < DETERMINED).sum())
-    print(
-        f"\ncompletion, {pattern}, {data.truth.shape}, {share:.0%} observed, {few} rows left out"
-    )
+    shape = " x ".join(map(str, data.truth.shape))
+    print(f"\ncompletion, {pattern}, {shape}, {share:.0%} observed, without {few} rows")
 
     def ours(passes):
         return lambda: complete(data.measured, data.observed, rank=RANK, passes=passes)

@@ -316,6 +316,8 @@ def test_bad_arguments_are_refused(arguments, message):
 def test_bad_matrices_are_refused():
     with pytest.raises(ShapeError, match=r"matrix: expected shape \(n_rows, n_columns\)"):
         complete(np.ones(3), rank=1)
+    with pytest.raises(InputError, match="observed: expected at least one observed entry"):
+        complete(np.ones((3, 4)), np.zeros((3, 4), bool), rank=1, method="brand")
     with pytest.raises(ShapeError, match="at least one row and column"):
         complete(np.ones((3, 0)), rank=1)
     with pytest.raises(InputError, match="finite values where observed, received inf in row 1"):
