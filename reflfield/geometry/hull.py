@@ -71,7 +71,7 @@ class HullOptions:
     resolution: int = 192
     tolerance: int = 0
     blur: float = 0.7
-    smoothing: int = 30
+    smoothing: int = 60
     n_triangles: int = 20_000
     minimum_component: float = 0.01
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None

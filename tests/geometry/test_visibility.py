@@ -1,0 +1,230 @@
+import numpy as np
+import pytest
+import trimesh
+
+from reflfield.capture.cameras import Camera
+from reflfield.capture.lights import Light
+from reflfield.errors import InputError
+from reflfield.geometry.atlas import Atlas, AtlasOptions, build_atlas
+from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.texels import texel_table
+from reflfield.geometry.visibility import (
+    RayScene,
+    VisibilityOptions,
+    check_light_outside,
+    depth_edges,
+    light_inside,
+    light_visibility,
+    shadow_edge,
+    view_visibility,
+)
+
+UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+
+
+def two_balls():
+    """A large ball at the origin and a small one above it."""
+    large = trimesh.creation.icosphere(subdivisions=3)
+    small = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+    small.apply_translation([0, 0, 1.8])
+    both = trimesh.util.concatenate([large, small])
+    return Mesh(both.vertices, both.faces)
+
+
+def floor_under_a_square(scale=1.0, origin=0.0):
+    """Floor of side 4 at z = 0, an occluder of side 1 at z = 1 around the axis."""
+    floor = np.column_stack([(UNIT_SQUARE - 0.5) * 4.0, np.zeros(4)])
+    roof = np.column_stack([UNIT_SQUARE - 0.5, np.ones(4)])
+    quads = [[0, 1, 2], [0, 2, 3]]
+    mesh = Mesh(np.concatenate([floor, roof]) * scale + origin, [*quads, [4, 5, 6], [4, 6, 7]])
+    atlas = Atlas(
+        positions=floor * scale + origin, faces=quads, uv=UNIT_SQUARE, chart=[0, 0],
+        normals=[[0, 0, 1]] * 4, height=40, width=40,
+    )  # fmt: skip
+    return RayScene(mesh), texel_table(atlas)
+
+
+def top_camera(kind="opencv", size=80, height=10.0, scale=1.0, origin=0.0):
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = -pose[:3, :3] @ (np.array([0, 0, height]) * scale + origin)
+    focal = size * height / 5.0 if kind == "opencv" else size / 5.0 / scale
+    return Camera("top", kind, size, size, focal, focal, size / 2, size / 2, pose)
+
+
+def shadow_of(light_height, texels):
+    """Signed distance of floor points to the square's shadow of a lamp on the axis."""
+    half = 0.5 * light_height / (light_height - 1.0)
+    return half - np.abs(texels.position[:, :2]).max(axis=1)
+
+
+@pytest.mark.reference
+def test_occlusion_and_hits_agree_with_brute_force(rng):
+    mesh = two_balls()
+    origins = rng.normal(size=(150, 3)) * 1.5
+    ways = rng.normal(size=(150, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    first, second, third = np.moveaxis(mesh.corners, 1, 0)
+    e1, e2 = second - first, third - first
+    # Moeller-Trumbore for all pairs.
+    p = np.cross(ways[:, None], e2[None])
+    determinant = (e1 * p).sum(axis=2)
+    offset = origins[:, None] - first
+    u = (offset * p).sum(axis=2) / determinant
+    q = np.cross(offset, e1)
+    v = (ways[:, None] * q).sum(axis=2) / determinant
+    t = (e2 * q).sum(axis=2) / determinant
+    crossing = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+    truth = np.where(crossing, t, np.inf).min(axis=1)
+    scene = RayScene(mesh)
+    distance, face, barycentric = scene.first_hit(origins, ways)
+    np.testing.assert_array_equal(np.isinf(distance), np.isinf(truth))
+    hit = np.isfinite(truth)
+    np.testing.assert_allclose(distance[hit], truth[hit], rtol=1e-5, atol=1e-5)  # float32
+    points = np.einsum("nk,nkd->nd", barycentric[hit], mesh.corners[face[hit]])
+    np.testing.assert_allclose(points, origins[hit] + truth[hit, None] * ways[hit], atol=2e-5)
+    np.testing.assert_array_equal(scene.occluded(origins, ways), hit)
+    limit = np.where(hit, truth * rng.choice([0.99, 1.01], size=len(truth)), 5.0)
+    np.testing.assert_array_equal(scene.occluded(origins, ways, limit), truth < limit)
+
+
+@pytest.mark.parametrize("height", [3.0, 50.0])
+def test_near_lamps_throw_the_shadow_of_a_point(height):
+    scene, texels = floor_under_a_square()
+    lamp = Light("l", "point", position=[0, 0, height])
+    lit = light_visibility(texels, scene, lamp)
+    away = np.abs(shadow_of(height, texels)) > 0.01
+    np.testing.assert_array_equal(lit[away], shadow_of(height, texels)[away] < 0.0)
+
+
+def test_a_lamp_below_the_occluder_is_not_blocked_by_it():
+    scene, texels = floor_under_a_square()
+    assert light_visibility(texels, scene, Light("l", "point", position=[0, 0, 0.9])).all()
+
+
+def test_far_and_unknown_lights():
+    scene, texels = floor_under_a_square()
+    lit = light_visibility(texels, scene, Light("l", "directional", direction=[0, 0, 1]))
+    np.testing.assert_array_equal(lit, np.abs(texels.position[:, :2]).max(axis=1) > 0.5)
+    below = Light("l", "directional", direction=[0, 0.1, -1])
+    assert not light_visibility(texels, scene, below).any()
+    assert light_visibility(texels, scene, Light("l", "unknown")).all()
+
+
+def test_shadow_edges_are_a_band_around_the_boundary():
+    scene, texels = floor_under_a_square()
+    lamp = Light("l", "point", position=[0, 0, 3.0])
+    band = VisibilityOptions(shadow_band=1.5)
+    on_edge = shadow_edge(texels, scene, lamp, band)
+    distance = np.abs(shadow_of(3.0, texels))
+    radius = 1.5 * texels.spacing
+    assert on_edge[distance < 0.5 * radius].all()
+    assert not on_edge[distance > 1.6 * radius].any()
+    assert not shadow_edge(texels, scene, Light("l", "unknown")).any()
+
+
+@pytest.mark.parametrize("kind", ["opencv", "orthographic"])
+def test_cameras_see_the_floor_beside_the_occluder(kind):
+    scene, texels = floor_under_a_square()
+    seen = view_visibility(texels, scene, top_camera(kind))
+    half = 0.5 * 10.0 / 9.0 if kind == "opencv" else 0.5
+    reach = np.abs(texels.position[:, :2]).max(axis=1)
+    pixel = 5.0 / 80.0
+    assert not seen[reach < half + pixel].any()  # hidden, or within the band of the edge
+    assert seen[(reach > half + 3 * pixel) & (reach < 2.0 - 3 * pixel)].all()
+    without_band = VisibilityOptions(edge_band=0.0)
+    seen = view_visibility(texels, scene, top_camera(kind), without_band)
+    away = np.abs(reach - half) > 0.01
+    np.testing.assert_array_equal(seen[away], reach[away] > half)
+
+
+def test_grazing_views_bad_pixels_and_texels_outside_the_frame_are_rejected():
+    scene, texels = floor_under_a_square()
+    camera = top_camera()
+    strict = VisibilityOptions(grazing_cosine=0.999, edge_band=0.0)
+    seen = view_visibility(texels, scene, camera, strict)
+    away_from_axis = np.linalg.norm(texels.position[:, :2], axis=1)
+    assert not seen[away_from_axis > 10.0 * np.tan(np.arccos(0.999))].any()
+    cropped = Camera(
+        "c", "opencv", 40, 80, camera.fl_x, camera.fl_y, 40, 40, camera.camera_from_world
+    )
+    seen = view_visibility(texels, scene, cropped)
+    assert not seen[texels.position[:, 0] > 0.0].any()
+    assert seen.any()
+    nowhere = np.zeros((80, 80), np.float32)
+    assert not view_visibility(texels, scene, camera, silhouette=nowhere).any()
+    shared = depth_edges(scene, camera, VisibilityOptions())
+    np.testing.assert_array_equal(
+        view_visibility(texels, scene, camera, edges=shared),
+        view_visibility(texels, scene, camera),
+    )
+
+
+def test_the_back_is_not_seen_and_blocks_do_not_matter():
+    mesh = two_balls()
+    texels = texel_table(build_atlas(mesh, AtlasOptions(resolution=64, method="boxes")))
+    scene = RayScene(mesh)
+    camera = top_camera()
+    seen = view_visibility(texels, scene, camera)
+    towards = camera.view_directions(texels.position)
+    assert not seen[(towards * texels.normal).sum(axis=1) < 0.15].any()
+    assert seen.mean() > 0.1
+    halves = [texels.subset(slice(0, 500)), texels.subset(slice(500, None))]
+    again = np.concatenate([view_visibility(half, scene, camera) for half in halves])
+    np.testing.assert_array_equal(seen, again)
+
+
+def test_a_surface_does_not_shadow_itself():
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    mesh = Mesh(ball.vertices, ball.faces)
+    texels = texel_table(build_atlas(mesh, AtlasOptions(resolution=64, method="boxes")))
+    lamp = Light("l", "directional", direction=[1, 2, 3])
+    lit = light_visibility(texels, RayScene(mesh), lamp)
+    cosine = texels.normal @ lamp.direction
+    assert lit[cosine > 0.1].all()
+    assert not lit[cosine < 0.0].any()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize(("scale", "origin"), [(1e-3, 0.0), (1.0, 1e3)])
+def test_shadows_do_not_depend_on_place_and_size(scale, origin):
+    scene, texels = floor_under_a_square(scale, origin)
+    lamp = Light("l", "point", position=np.array([0, 0, 3.0]) * scale + origin)
+    lit = light_visibility(texels, scene, lamp)
+    reference_scene, reference = floor_under_a_square()
+    np.testing.assert_array_equal(
+        lit,
+        light_visibility(reference, reference_scene, Light("l", "point", position=[0, 0, 3])),
+    )
+    camera = top_camera(scale=scale, origin=origin)
+    np.testing.assert_array_equal(
+        view_visibility(texels, scene, camera),
+        view_visibility(reference, reference_scene, top_camera()),
+    )
+
+
+def test_a_light_inside_the_object_is_refused_by_name():
+    mesh = two_balls()
+    assert light_inside(mesh, [0.5, 0, 0])
+    assert light_inside(mesh, [0, 0, 1.8])
+    assert not light_inside(mesh, [0, 0, 1.25])
+    assert not light_inside(mesh, [1e6, 0, 0])
+    assert not light_inside(Mesh(mesh.vertices, mesh.faces[1:]), [0.5, 0, 0])  # not closed
+    with pytest.raises(InputError, match=r"light 'l042'.*inside its hull"):
+        check_light_outside(RayScene(mesh), Light("l042", "point", position=[0.5, 0, 0]))
+    check_light_outside(RayScene(mesh), Light("l", "directional"))
+
+
+def test_options_are_checked():
+    with pytest.raises(InputError, match="grazing_cosine"):
+        VisibilityOptions(grazing_cosine=1.0)
+    with pytest.raises(InputError, match="edge_band"):
+        VisibilityOptions(edge_band=-1.0)
+
+
+@pytest.mark.stability
+def test_rays_that_start_far_away_keep_their_digits():
+    scene = RayScene(two_balls())
+    start, way = [[0.0, 0.0, 1e4]] * 2, [[0.0, 0.0, -1.0]] * 2
+    top = 1e4 - 2.1  # the small ball's pole is a vertex of its icosphere
+    assert scene.first_hit(start, way)[0] == pytest.approx(top, abs=1e-5)
+    assert scene.occluded(start, way, [top - 1e-3, top + 1e-3]).tolist() == [False, True]
