@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import fast_simplification
 import numpy as np
 import open3d
 import trimesh
@@ -314,9 +313,9 @@ def _neighbour_average(mesh: Mesh) -> sparse.csr_array:
 def decimate(mesh: Mesh, n_triangles: int) -> Mesh:
     """Fewer triangles by quadric edge collapse; a closed mesh stays closed.
 
-    The fast collapse can pinch sharp ridges so that an edge joins four faces; Open3D's,
-    ten times slower, is taken then. Should it fail as well, the mesh is returned as
-    it came.
+    Open3D's collapse is taken: the ten times faster one of `fast-simplification` pinched
+    ridges into edges of four faces and folded triangles over (14 on a hull of 20,000,
+    which cost 18 charts more). Should the result be open, the mesh is returned as it came.
 
     Parameters
     ----------
@@ -335,31 +334,18 @@ def decimate(mesh: Mesh, n_triangles: int) -> Mesh:
     """
     if len(mesh.faces) <= n_triangles:
         return mesh
-    # Both libraries want a unit box at the origin, one because of single precision.
+    # Moved to a unit box at the origin, so that tolerances inside do not matter.
     origin, scale = mesh.bounds.mean(axis=0), mesh.diagonal
-    unit = Mesh((mesh.vertices - origin) / scale, mesh.faces)
-    for collapse in (_fast_collapse, _careful_collapse):
-        smaller = collapse(unit, n_triangles)
-        if len(smaller.faces) and (smaller.watertight or not mesh.watertight):
-            return Mesh(smaller.vertices * scale + origin, smaller.faces)
-    return mesh
-
-
-def _fast_collapse(mesh: Mesh, n_triangles: int) -> Mesh:
-    points, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float32), mesh.faces, target_count=n_triangles
-    )
-    return without_degenerate_faces(Mesh(points, faces))
-
-
-def _careful_collapse(mesh: Mesh, n_triangles: int) -> Mesh:
     dense = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces)
+        open3d.utility.Vector3dVector((mesh.vertices - origin) / scale),
+        open3d.utility.Vector3iVector(mesh.faces),
     )
     reduced = dense.simplify_quadric_decimation(n_triangles)
-    return without_degenerate_faces(
-        Mesh(np.asarray(reduced.vertices), np.asarray(reduced.triangles))
-    )
+    points = np.asarray(reduced.vertices) * scale + origin
+    smaller = without_degenerate_faces(Mesh(points, np.asarray(reduced.triangles)))
+    if len(smaller.faces) and (smaller.watertight or not mesh.watertight):
+        return smaller
+    return mesh
 
 
 def write_ply(path: Path | str, mesh: Mesh) -> None:
