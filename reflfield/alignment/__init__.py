@@ -1,6 +1,15 @@
 """Local frames from reflectance: correlation over SO(3), clusters, refinement, normal maps."""
 
 from reflfield.alignment.aligning import Alignment, SampleSource, align
+from reflfield.alignment.normal_maps import local_map, world_map
 from reflfield.alignment.searching import SearchResult, search
 
-__all__ = ["Alignment", "SampleSource", "SearchResult", "align", "search"]
+__all__ = [
+    "Alignment",
+    "SampleSource",
+    "SearchResult",
+    "align",
+    "local_map",
+    "search",
+    "world_map",
+]

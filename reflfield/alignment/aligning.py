@@ -189,9 +189,8 @@ def align(
     # Give the frames a meaning, and sharpen the targets on samples.
     weights = np.where(training.norms() > 0, np.maximum(fit.found.score, 0.0), 0.0)
     gauged = fix_gauge(fit.targets, fit.found.rotations, fit.found.cluster, weights)
-    fit = replace(
-        fit, targets=gauged.targets, found=replace(fit.found, rotations=gauged.rotations)
-    )
+    found = _search(task, training, gauged, gauged.rotations)
+    fit = replace(fit, targets=gauged.targets, found=found)
     sharp = _sharpen(task, rows, training, fit, RefinementOptions()) if refine else None
     # Find the frames of all texels, block by block.
     return _finish(task, rows, fit, gauged, sharp)
@@ -364,6 +363,7 @@ def _finish(
             _refine_block(task, part, samples, found, sharp)
     last = sharp.regauged if sharp else gauged
     base_from_local = _fold_all(found.rotations, found.cluster, last)
+    base_from_local[found.score == 0.0] = np.eye(3)
     return Alignment(
         local_from_base=np.ascontiguousarray(np.swapaxes(base_from_local, 1, 2)),
         cluster=found.cluster,

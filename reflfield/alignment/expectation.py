@@ -90,7 +90,7 @@ def fit_targets(
     """
     norms = source.norms()
     weights = _weights(norms)
-    units = source.scaled(np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0))
+    units = source.units()
     options: SearchOptions = {"max_tilt": max_tilt, "n_threads": n_threads}
     targets = seed_targets(units, weights, n_clusters, rng, options)
     history: list[float] = []
@@ -184,9 +184,7 @@ def mean_targets(
         `n_targets` functions; zero where a cluster is empty.
     """
     totals = [_turned_sum(units, weights, found, k) for k in range(n_targets)]
-    means = join_coupled(totals)
-    norms = means.norms()
-    return means.scaled(np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0))
+    return join_coupled(totals).units()
 
 
 def _turned_sum(

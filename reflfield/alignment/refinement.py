@@ -33,6 +33,8 @@ HALF_STEP = np.deg2rad(0.25)
 # Directions this close to the frame's horizon are left out: their taps would leave the grid
 # within one step.
 LOWEST_Z = float(np.sin(np.deg2rad(1.0)))
+# Reordering of sums only: samples may be NaN, which full fast mathematics assumes away.
+FAST = {"reassoc", "contract", "nsz", "arcp"}
 LONGEST_STEP = np.deg2rad(4.0)
 DAMPING = 1e-4
 BLOCK = 128
@@ -160,7 +162,7 @@ def _place(
             places[i, 5 + k] = (v1 - v0) * scale
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def _blend(
     target: NDArray[np.float32],
     node: int,
@@ -257,7 +259,7 @@ def spread(
                 sums[node + up + right, k] += w3 * out[k]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _add_row(
     row: NDArray[np.float32],
     place: NDArray[np.float64],
@@ -274,7 +276,7 @@ def _add_row(
     jacobian = np.zeros(5)
     for k in range(row.shape[0]):
         node, value = l_nodes[k], row[k]
-        if node < 0 or not np.abs(value) < 1e30:
+        if node < 0 or not np.isfinite(value):
             continue
         a, b = l_places[k, 0], l_places[k, 1]
         p0, p1 = lines[0, node], lines[0, node + right]
@@ -342,7 +344,7 @@ def _solve(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
     return bool(np.isfinite(length))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def improve(
     samples: NDArray[np.float32],
     views: NDArray[np.float64],

@@ -131,8 +131,8 @@ def search(
     if start is not None:
         starts = np.asarray(start, dtype=np.float64)
         check_shape("start", starts, (n, 3, 3))
-    norms = np.maximum(target.norms(), 1e-300)
-    targets = [target[k : k + 1].scaled(1.0 / norms[k : k + 1]) for k in range(len(target))]
+    unit = target.units()
+    targets = [unit[k : k + 1] for k in range(len(target))]
 
     plan = _Plan(tuple(targets), tuple(half_turns), max_tilt, n_peaks, margins)
 
@@ -199,7 +199,7 @@ def _search_block(
     """Search of a few functions against all (unit) targets."""
     norms = source.norms()
     # Unit functions, so that the float32 kernels never meet 1e-12 or 1e12.
-    source = source.scaled(np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0))
+    source = source.units()
     series = [spectrum(source, target) for target in plan.targets]
     coarse = [_coarse_peaks(s, source.n_degrees, plan) for s in series]
     best = SearchResult(

@@ -191,6 +191,11 @@ class Coupled:
         squares = [np.einsum("nij,nij->n", b, b, dtype=np.float64) for b in self.blocks]
         return np.sqrt(np.sum(squares, axis=0))
 
+    def units(self) -> Coupled:
+        """Each function over its norm; zero functions stay zero."""
+        norms = self.norms()
+        return self.scaled(np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0))
+
     def scaled(self, factors: NDArray[np.floating]) -> Coupled:
         """Each function times its factor, (n,)."""
         factors = np.asarray(factors).astype(self.dtype)[:, None, None]

@@ -28,6 +28,9 @@ from reflfield.errors import InputError
 # read without a test.
 ROW_MARGIN = 2
 MAX_DEGREE = 256
+# Near beta = 0 and pi the two solutions of the recursion grow alike and rounding grows
+# with the square of the degree; there the matrix is made as a product of two others.
+DEGENERATE_SINE = 0.1
 
 
 def block_offsets(degree_limit: int) -> NDArray[np.int64]:
@@ -73,6 +76,13 @@ def wigner_d(degree: int, beta: float) -> NDArray[np.float64]:
         raise InputError(f"degree: expected 0 to {MAX_DEGREE}, received {degree}")
     if not np.isfinite(beta):
         raise InputError(f"beta: expected a finite angle, received {beta}")
+    if abs(np.sin(beta)) < DEGENERATE_SINE:
+        return _ascend(degree, beta + 1.0) @ _ascend(degree, 1.0).T
+    return _ascend(degree, beta)
+
+
+def _ascend(degree: int, beta: float) -> NDArray[np.float64]:
+    """The recursion from degree 0 upwards."""
     older = np.zeros((1, 1))
     newer = np.ones((1, 1))
     edge = np.ones(1)

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from reflfield.errors import InputError
+from reflfield.sphere.hemisphere import HemisphereGrid
+from reflfield.sphere.projection import (
+    Projector,
+    direction_operator,
+    lower_gram,
+    safe_band_limit,
+    solid_angles,
+)
+
+GRID = HemisphereGrid(9).directions
+
+
+def test_lower_hemisphere_gram_and_its_mirror_make_the_identity(rounding):
+    gram = lower_gram(7)
+    ell = np.floor(np.sqrt(np.arange(49)))
+    m = np.arange(49) - ell * ell - ell
+    parity = (-1.0) ** (ell + np.abs(m))  # of z -> -z
+    total = gram + parity[:, None] * gram * parity
+    np.testing.assert_allclose(total, np.eye(49), atol=rounding(np.float64, 50))
+
+
+def test_smooth_function_of_the_upper_hemisphere_is_recovered():
+    # cos^3 vanishes smoothly at the horizon, so band limit 8 holds it to about 1 %.
+    operator = direction_operator("views", GRID, 8)
+    samples = np.maximum(GRID[:, 2], 0) ** 3
+    back = operator.synthesis @ (operator.analysis @ samples)
+    assert np.abs(back - samples)[GRID[:, 2] > 0].max() < 0.02
+
+
+def test_both_directions_match_one_after_the_other(rng, rounding):
+    samples = rng.standard_normal((3, 81, 81))
+    projector = Projector(GRID, GRID, (4, 6))
+    view, light = direction_operator("views", GRID, 4), direction_operator("lights", GRID, 6)
+    expected = np.einsum("av,nvl,bl->nab", view.analysis, samples, light.analysis)
+    np.testing.assert_allclose(
+        projector.project(samples), expected, atol=rounding(np.float64, 81, scale=10)
+    )
+
+
+def test_filling_keeps_observed_samples_and_ignores_what_stands_under_the_others(rng):
+    smooth = np.exp(GRID @ np.array([0.3, 0.2, 0.5]))
+    samples = (np.outer(smooth, smooth)[None] * np.array([1.0, 3.0])[:, None, None]).astype(
+        "f4"
+    )
+    observed = rng.random(samples.shape) < 0.5
+    broken = np.where(observed, samples, np.nan)
+    broken[0, ~observed[0]] = np.inf
+    projector = Projector(GRID, GRID, (4, 4))
+    filled = projector.fill(broken, np.ones((81, 81), np.float32))
+    assert np.array_equal(filled[observed], samples[observed])
+    inside = GRID[:, 2] > 0.3
+    error = np.abs(filled - samples)[:, inside][:, :, inside] / samples[:, inside][:, :, inside]
+    assert np.median(error) < 0.1
+
+
+def test_direction_that_does_not_vary_has_one_coefficient_its_mean(rounding):
+    projector = Projector(GRID[40:41], GRID, (1, 5))
+    coefficients = projector.project(np.ones((1, 1, 81)))
+    assert coefficients.shape == (1, 1, 25)
+    back = projector.synthesize(coefficients)
+    assert np.median(np.abs(back[0, 0, GRID[:, 2] > 0.3] - 1)) < 0.1
+
+
+def test_solid_angles_sum_to_the_hemisphere_and_ignore_what_lies_below(rounding):
+    below = np.array([[0.6, 0.0, -0.8]])
+    shares = solid_angles(np.concatenate([GRID, below]))
+    assert shares.sum() == pytest.approx(2 * np.pi, abs=rounding(np.float64, 81))
+    assert shares[-1] == 0.0
+
+
+def test_band_limit_beyond_the_directions_names_the_safe_one():
+    few = GRID[GRID[:, 2] > 0.5]
+    safe = safe_band_limit(len(few))
+    direction_operator("views", few, safe)
+    with pytest.raises(InputError, match=f"{safe} is safe"):
+        direction_operator("views", few, safe + 1)

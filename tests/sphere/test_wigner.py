@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from reflfield.errors import InputError, ShapeError
+from reflfield.sphere.harmonics import real_harmonics
+from reflfield.sphere.rotations import matrix_from_euler
+from reflfield.sphere.wigner import (
+    block_offsets,
+    degree_tables,
+    fill_wigner_d,
+    rotate_coefficients,
+    rotation_blocks,
+    wigner_d,
+)
+
+# Rotations at which Euler angles are not unique, and general ones.
+SPECIAL = [np.eye(3), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1]), np.diag([-1.0, 1, -1])]
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("beta", [1e-8, 0.3, np.pi / 2, 3.0, np.pi])
+def test_degree_256_is_orthogonal(beta):
+    d = wigner_d(256, beta)
+    assert np.abs(d @ d.T - np.eye(513)).max() < 1e-12  # demanded by the design
+
+
+@pytest.mark.stability
+def test_loss_of_orthogonality_grows_at_most_linearly_with_the_degree():
+    degrees = np.array([8, 16, 32, 64, 128])
+    errors = []
+    for degree in degrees:
+        d = wigner_d(int(degree), 1.1)
+        errors.append(np.abs(d @ d.T - np.eye(2 * degree + 1)).max())
+    slope = np.polyfit(np.log(degrees), np.log(errors), 1)[0]
+    assert slope < 1.5  # one step of the recursion per degree, plus scatter
+
+
+def test_kernel_and_matrix_form_agree(rounding):
+    tables = degree_tables(15, "float64")
+    d = np.zeros(tables.row_start[-1])
+    for beta in (0.0, 0.7, np.pi):
+        fill_wigner_d(beta, tables.row_start, tables.recursion, tables.edge, d)
+        for j in range(15):
+            rows = d[tables.row_start[j] : tables.row_start[j + 1]].reshape(j + 1, -1)
+            centre = rows.shape[1] // 2
+            kept = rows[:, centre - j : centre + j + 1]
+            np.testing.assert_allclose(
+                kept, wigner_d(j, beta)[j:], atol=rounding(np.float64, 20)
+            )
+
+
+def test_single_precision_stays_within_its_rounding(rounding):
+    turns = Rotation.random(20, random_state=1).as_matrix()
+    double, single = rotation_blocks(turns, 31), rotation_blocks(turns, 31, "float32")
+    assert np.abs(double - single).max() < rounding(np.float32, operations=31)
+
+
+def test_turned_function_is_the_function_at_turned_directions(rng, rounding):
+    turns = np.concatenate([SPECIAL, Rotation.random(6, random_state=2).as_matrix()])
+    points = rng.standard_normal((30, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    coefficients = rng.standard_normal((len(turns), 144))
+    turned = rotate_coefficients(coefficients, turns)
+    for r, before, after in zip(turns, coefficients, turned, strict=True):
+        np.testing.assert_allclose(
+            real_harmonics(points, 12) @ after,
+            real_harmonics(points @ r, 12) @ before,
+            atol=rounding(np.float64, 144, scale=4),
+        )
+
+
+def test_product_of_rotations_is_product_of_matrices(rounding):
+    first, second = Rotation.random(2, random_state=3).as_matrix()
+    a, b, c = (rotation_blocks(r[None], 9)[0] for r in (first, second, first @ second))
+    offsets = block_offsets(9)
+    for j in range(9):
+        part, shape = slice(offsets[j], offsets[j + 1]), (2 * j + 1, 2 * j + 1)
+        product = a[part].reshape(shape) @ b[part].reshape(shape)
+        np.testing.assert_allclose(product, c[part].reshape(shape), atol=rounding(float, 30))
+
+
+def test_rotation_about_z_mixes_only_equal_orders():
+    block = rotation_blocks(matrix_from_euler(0.4, 0.0, 0.0)[None], 3)[0, 10:35].reshape(5, 5)
+    m = np.abs(np.arange(-2, 3))
+    assert np.abs(block[m[:, None] != m[None, :]]).max() == 0.0
+    assert block[4, 4] == pytest.approx(np.cos(0.8), abs=1e-15)
+
+
+@pytest.mark.parametrize(("degree", "beta"), [(-1, 0.0), (257, 0.0), (3, np.nan)])
+def test_arguments_out_of_range_are_refused(degree, beta):
+    with pytest.raises(InputError, match=r"^(degree|beta): expected"):
+        wigner_d(degree, beta)
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ShapeError, match="rotations"):
+        rotation_blocks(np.eye(3), 3)
+    with pytest.raises(ShapeError, match="coefficients"):
+        rotate_coefficients(np.zeros(5), np.eye(3)[None])
