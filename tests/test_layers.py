@@ -1,0 +1,146 @@
+"""Imports run one way: each room uses only those before it, none hides in a function."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# From the ground up. A room may import itself and any room to its left.
+ROOMS = (
+    "errors",
+    "checks",
+    "progress",
+    "config",
+    "sphere",
+    "factorization",
+    "capture",
+    "geometry",
+    "observations",
+    "alignment",
+    "field",
+    "relighting",
+    "comparison",
+    "export",
+    "stages",
+    "steps",
+    "pipeline",
+    "demo",
+    "cli",
+)
+# Commands import what they need when they run, so that --help answers at once.
+IMPORTS_LATE = {Path("reflfield/cli.py")}
+
+
+class Import(NamedTuple):
+    line: int
+    module: str  # absolute, dotted
+    inside_function: bool
+
+
+def imports_of(tree: ast.AST, package: str, inside: bool = False) -> Iterator[Import]:
+    """All imports of a module; relative ones made absolute."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import):
+            yield from (Import(node.lineno, alias.name, inside) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")[: len(package.split(".")) - node.level + 1]
+            base = ".".join(parts if node.level else [])
+            module = ".".join(filter(None, (base, node.module)))
+            # "from package import room" names the room only among the imported names.
+            yield from (
+                Import(node.lineno, f"{module}.{alias.name}", inside) for alias in node.names
+            )
+        function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        yield from imports_of(node, package, inside or function)
+
+
+def modules(package: str) -> list[Path]:
+    return sorted(path.relative_to(ROOT) for path in (ROOT / package).rglob("*.py"))
+
+
+def imports_in(path: Path) -> list[Import]:
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    return list(imports_of(tree, ".".join(path.parent.parts)))
+
+
+def room_of(path: Path) -> str:
+    return Path(path.parts[1]).stem
+
+
+def breaches(room: str, found: list[Import]) -> list[Import]:
+    """Imports of rooms that come later than `room`."""
+    allowed = ROOMS[: ROOMS.index(room) + 1]
+    return [
+        one
+        for one in found
+        if one.module.startswith("reflfield.")
+        and (name := one.module.split(".")[1]) in ROOMS
+        and name not in allowed
+    ]
+
+
+def test_every_room_has_its_place():
+    present = {room_of(path) for path in modules("reflfield")} - {"__init__"}
+    assert present == set(ROOMS)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_rooms_import_only_earlier_rooms(room):
+    found = {
+        str(path): breaches(room, imports_in(path))
+        for path in modules("reflfield")
+        if room_of(path) == room
+    }
+    assert {path: bad for path, bad in found.items() if bad} == {}
+
+
+def test_the_package_itself_imports_no_room():
+    assert imports_in(Path("reflfield/__init__.py")) == []
+
+
+@pytest.mark.parametrize(
+    ("package", "other"), [("reflfield", "capture_sim"), ("capture_sim", "reflfield")]
+)
+def test_pipeline_and_simulator_share_no_code(package, other):
+    crossing = {
+        str(path): one
+        for path in modules(package)
+        for one in imports_in(path)
+        if one.module.split(".")[0] == other
+    }
+    assert crossing == {}
+
+
+@pytest.mark.parametrize("package", ["reflfield", "capture_sim"])
+def test_no_import_hides_inside_a_function(package):
+    hidden = {
+        f"{path}:{one.line}": one.module
+        for path in modules(package)
+        if path not in IMPORTS_LATE
+        for one in imports_in(path)
+        if one.inside_function
+    }
+    assert hidden == {}
+
+
+def test_the_check_sees_what_it_must():
+    source = (
+        "from reflfield.field import model\n"
+        "from reflfield import relighting\n"
+        "from ..pipeline import run\n"
+        "def later():\n"
+        "    import reflfield.cli\n"
+    )
+    found = list(imports_of(ast.parse(source), "reflfield.field"))
+    assert [one.module for one in found] == [
+        "reflfield.field.model",
+        "reflfield.relighting",
+        "reflfield.pipeline.run",
+        "reflfield.cli",
+    ]
+    assert [one.inside_function for one in found] == [False, False, False, True]
+    assert [one.line for one in breaches("field", found)] == [2, 3, 5]
