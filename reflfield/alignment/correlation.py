@@ -36,11 +36,13 @@ from reflfield.sphere.wigner import (
     rotation_blocks,
 )
 
-# Degrees 0 .. 6 vary over about 60 degrees; 2,500 rotations lie 18 degrees apart.
-COARSE_DEGREES = 7
-COARSE_ROTATIONS = 2500
+# Degrees 0 .. 5 vary over about 70 degrees; 2,000 rotations lie 20 degrees apart.
+COARSE_DEGREES = 6
+COARSE_ROTATIONS = 2000
 # Two rotations closer than this are the same peak.
 PEAK_DISTANCE = np.deg2rad(15.0)
+# The first step of each peak uses the degrees up to this.
+SCREENING_DEGREE = 8
 SCREENING_STEPS = 2
 POLISHING_STEPS = 12
 # A step this short moves the peak by less than a hundredth of a degree.
@@ -345,6 +347,23 @@ def turned(r: NDArray[np.float64], w: NDArray[np.float64], out: NDArray[np.float
 
 
 @numba.njit(cache=True, nogil=True)
+def _try_step(
+    rotation: NDArray[np.float64],
+    step: NDArray[np.float64],
+    length: float,
+    lowest_z: float,
+    trial: NDArray[np.float64],
+) -> float:
+    """Take the step, halved until the tilt is allowed; its length."""
+    turned(rotation, step, trial)
+    while trial[2, 2] < lowest_z and length > CONVERGED_STEP:
+        step *= 0.5
+        length *= 0.5
+        turned(rotation, step, trial)
+    return length
+
+
+@numba.njit(cache=True, nogil=True)
 def climb(
     series: NDArray[np.floating],
     rows: NDArray[np.int64],
@@ -394,12 +413,11 @@ def climb(
             else:
                 radius = 0.25 * length
             length = _newton_step(found[i], radius, step)
-            turned(rotations[i], step, trial)
-            while trial[2, 2] < lowest_z and length > CONVERGED_STEP:
-                step *= 0.5
-                length *= 0.5
-                turned(rotations[i], step, trial)
+            length = _try_step(rotations[i], step, length, lowest_z, trial)
             if length < CONVERGED_STEP:
+                # Too short to be worth an evaluation, but free to take.
+                if trial[2, 2] >= lowest_z:
+                    rotations[i] = trial
                 break
         found[i, 10] = length
 

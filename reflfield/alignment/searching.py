@@ -15,6 +15,7 @@ from reflfield.alignment.correlation import (
     COARSE_ROTATIONS,
     PEAK_DISTANCE,
     POLISHING_STEPS,
+    SCREENING_DEGREE,
     SCREENING_STEPS,
     climb,
     coarse_grid,
@@ -32,7 +33,7 @@ N_PEAKS = 4
 # Targets whose coarse peak is among the best few are searched with all degrees.
 N_FINALISTS = 3
 # Peaks that reach less than this share of the highest after one step are given up.
-HOPEFUL = 0.8
+HOPEFUL = 0.9
 Result = TypeVar("Result")
 
 
@@ -253,8 +254,9 @@ def follow(
     rotations: NDArray[np.float64],
     n_steps: int,
     max_tilt: float | None = None,
+    highest: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Climb from each rotation with all degrees.
+    """Climb from each rotation, by default with all degrees.
 
     Parameters
     ----------
@@ -268,6 +270,8 @@ def follow(
         0: evaluate only.
     max_tilt : float, optional
         Radians.
+    highest : int, optional
+        Only degrees up to this are used.
 
     Returns
     -------
@@ -277,6 +281,7 @@ def follow(
     """
     n_degrees = int(np.searchsorted(block_offsets(64), series.shape[1]))
     tables = degree_tables(n_degrees, str(series.dtype))
+    used = n_degrees if highest is None else min(highest + 1, n_degrees)
     moved = np.ascontiguousarray(rotations, dtype=np.float64).copy()
     found = np.zeros((len(moved), 11))
     lowest_z = -2.0 if max_tilt is None else float(np.cos(max_tilt))
@@ -286,7 +291,7 @@ def follow(
         moved,
         n_steps,
         lowest_z,
-        tables.row_start,
+        tables.row_start[: used + 1],
         tables.recursion,
         tables.edge,
         tables.ladder,
@@ -328,11 +333,14 @@ def _screen(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Rows, rotations and values of the candidates after the steps each deserves."""
     rows = candidates.rows
-    moved, found = follow(series, rows, candidates.rotations, 1, max_tilt)
+    moved, found = follow(series, rows, candidates.rotations, 1, max_tilt, SCREENING_DEGREE)
     values = found[:, 0]
     highest = values[best_of_each(rows, values)]
     index = np.cumsum(np.concatenate([[0], np.diff(rows) > 0]))
-    near = np.flatnonzero(values > HOPEFUL * highest[index])
+    hopeful = values >= HOPEFUL * highest[index]
+    # One that stands alone is the best already, and goes straight to its peak.
+    together = np.bincount(index[hopeful], minlength=len(highest))
+    near = np.flatnonzero(hopeful & (together[index] > 1))
     moved[near], found = follow(series, rows[near], moved[near], SCREENING_STEPS, max_tilt)
     values[near] = found[:, 0]
     return rows, moved, values
