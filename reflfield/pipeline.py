@@ -14,6 +14,7 @@ from typing import Any
 from reflfield.capture.model import Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
+from reflfield.stages import only_run
 from reflfield.steps import evaluation, outputs, reflectance, surface
 from reflfield.steps.job import Job
 from reflfield.steps.options import PipelineOptions
@@ -73,6 +74,11 @@ def run(
     """
     wanted = STAGES[: _number("--until", last) + 1]
     redo = frozenset(STAGES[_number("--from", first) :]) if first else frozenset()
+    if redo and redo.isdisjoint(wanted):
+        raise InputError(
+            f"--from, --until: expected the first stage not after the last, received {first} "
+            f"after {last}"
+        )
     options = options or PipelineOptions()
     job = Job(capture, out, options, hold_out or HoldOut(), resources or Resources(), redo)
     training, key = job.training, job.stages.key
@@ -133,7 +139,7 @@ def run(
         "compression": lambda: stage(
             "compression",
             reflectance.write_compression,
-            (options.compression, options.seed),
+            (options.compression, options.seed, capture.name),
             alignment=key("alignment"),
         ),
         # held-out photographs against the field relit from their cameras
@@ -142,16 +148,17 @@ def run(
             evaluation.write_comparison,
             options.relighting,
             compression=key("compression"),
-            frames=job.held_frames.digest(),
+            **{name: f.digest() for name, f in evaluation.frame_sets(job).items()},
         ),
         # everything that was found, in one page
         "report": lambda: stage(
             "report", outputs.write_report_page, comparison=key("comparison")
         ),
     }
-    for name in wanted:
-        stages[name]()
-    outputs.publish(job)
+    with only_run(job.stages.root):
+        for name in wanted:
+            stages[name]()
+        outputs.publish(job)
     return job
 
 

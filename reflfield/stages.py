@@ -3,21 +3,21 @@
 Each stage owns one folder. Its key is the SHA-256 of its name, the version of its code, its
 options and the keys of the stages it reads, so a folder whose key matches holds what
 the stage would compute again. Work goes into ``NAME.partial`` and is renamed when it
-is complete; a killed run leaves at most that folder, which the next run removes.
+is complete; a stage that fails removes it, and what a killed run leaves of it the next run
+removes. One run at a time may work in a folder.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,13 @@ import psutil
 
 from reflfield.errors import InputError
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # not on Windows: there, runs are not kept apart
+    fcntl = None  # type: ignore[assignment]
+
 RECORD = "stage.json"
+LOCK = ".lock"
 # Packages whose version may change what a stage computes.
 NUMERICAL_PACKAGES = ("numpy", "scipy", "numba", "open3d-cpu", "open3d", "xatlas", "zarr")
 
@@ -147,25 +153,22 @@ class StageFolder:
         if earlier is not None:
             self.records.append(earlier)
             return folder
-        partial = self.root / f"{name}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
-        started = time.perf_counter()
-        with MemoryWatch() as watch:
-            counts = dict(compute(partial))
-        record = StageRecord(
-            name=name,
-            key=key,
-            seconds=time.perf_counter() - started,
-            peak_bytes=watch.peak_bytes,
-            size_bytes=folder_bytes(partial),
-            counts=counts,
-        )
-        described = {**asdict(record), "options": plain(options), "inputs": dict(inputs or {})}
-        (partial / RECORD).write_text(
-            json.dumps({**described, "versions": versions()}, indent=1)
-        )
-        replace_folder(partial, folder)
+        with replacing_folder(folder) as partial:
+            started = time.perf_counter()
+            with MemoryWatch() as watch:
+                counts = dict(compute(partial))
+            record = StageRecord(
+                name=name,
+                key=key,
+                seconds=time.perf_counter() - started,
+                peak_bytes=watch.peak_bytes,
+                size_bytes=folder_bytes(partial),
+                counts=counts,
+            )
+            described = {"options": plain(options), "inputs": dict(inputs or {})}
+            (partial / RECORD).write_text(
+                json.dumps({**asdict(record), **described, "versions": versions()}, indent=1)
+            )
         self.records.append(record)
         return folder
 
@@ -211,17 +214,10 @@ def _matching_record(folder: Path, key: str) -> StageRecord | None:
         found = json.loads((folder / RECORD).read_text())
     except (OSError, ValueError):
         return None
-    if found.get("key") != key:
+    if not isinstance(found, dict) or found.get("key") != key:
         return None
-    return StageRecord(
-        name=found["name"],
-        key=key,
-        seconds=found["seconds"],
-        peak_bytes=found["peak_bytes"],
-        size_bytes=found["size_bytes"],
-        counts=found["counts"],
-        reused=True,
-    )
+    kept = {entry.name: found[entry.name] for entry in fields(StageRecord)}
+    return StageRecord(**{**kept, "reused": True})
 
 
 def folder_bytes(folder: Path) -> int:
@@ -229,18 +225,58 @@ def folder_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def replace_folder(partial: Path, folder: Path) -> None:
-    """Put a finished folder in the place of an earlier one."""
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """Yield a new folder that takes the place of `folder` if the block succeeds, else vanishes.
+
+    The earlier folder loses its record before its files: killed in between, it is
+    computed again, and never taken for complete.
+    """
+    partial = folder.with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    try:
+        yield partial
+        (folder / RECORD).unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name that becomes `path` if the block succeeds, else vanishes."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    """Yield a temporary name that becomes `path` if the block succeeds, else vanishes.
+
+    The name is always the same, so that what a killed run left of it is written over.
+    """
+    partial = path.with_name(f".{path.name}.partial")
     try:
         yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def only_run(root: Path) -> Iterator[None]:
+    """Keep other runs out of a folder while the block runs.
+
+    The system releases the lock when the process ends, however it ends.
+
+    Raises
+    ------
+    InputError
+        If another run holds it.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / LOCK).open("w") as lock:
+        if fcntl is not None:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(
+                    f"{root}: expected a folder for this run alone, found another run working "
+                    "in it; wait for it, or choose another folder"
+                ) from None
+        yield

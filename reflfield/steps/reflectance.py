@@ -325,7 +325,10 @@ def field_of(job: Job, model: ClusteredModel, frames: Floats) -> ReflectanceFiel
 
 
 def field_metadata(job: Job) -> dict[str, Any]:
-    """What a field says of its making."""
+    """What a field says of its making: nothing that a change would not make again."""
+    options = {
+        name: value for name, value in plain(job.options).items() if name != "relighting"
+    }
     return {
         "capture": job.capture.name,
         "up": job.capture.up.tolist(),
@@ -333,7 +336,7 @@ def field_metadata(job: Job) -> dict[str, Any]:
         "lights": job.training.n_lights,
         "photographs": len(job.training.photographs),
         "held_out": {"views": job.hold_out.views, "lights": job.hold_out.lights},
-        "options": plain(job.options),
+        "options": options,
         "versions": versions(),
     }
 
