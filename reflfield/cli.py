@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -23,7 +25,7 @@ from rich.progress import (
 
 from reflfield import __version__
 from reflfield.errors import InputError, ReflfieldError
-from reflfield.progress import listening
+from reflfield.progress import ProgressLines, listening
 
 # The libraries that do the work take seconds to import: commands import what they need,
 # so that --help and wrong arguments answer at once.
@@ -36,6 +38,7 @@ app = typer.Typer(
     help="Dome photographs to relightable objects.",
 )
 errors = Console(stderr=True, highlight=False)
+GOES_ON = "the same command goes on where it stopped"
 
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")]
 Format = Annotated[
@@ -47,20 +50,38 @@ Samples = Annotated[int, typer.Option(help="Rays per pixel, a square number.")]
 
 
 def main() -> None:
-    """Entry point: errors of input end with one message and status 2."""
+    """Entry point: input that cannot be used ends with one message and status 2."""
     try:
         app()
     except ReflfieldError as error:
-        errors.print(f"reflfield: error: {error}", markup=False, soft_wrap=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        errors.print("reflfield: interrupted; the same command goes on where it stopped")
-        sys.exit(130)
+        fail(str(error))
+    except OSError as error:  # a folder that cannot be written, a full disk
+        fail(f"{error.filename or 'system'}: {error.strerror or error}")
+
+
+def fail(message: str) -> NoReturn:
+    """Say what is wrong, and end with status 2."""
+    say_error(f"reflfield: error: {message}")
+    sys.exit(2)
 
 
 @contextmanager
-def progress_bars() -> Iterator[None]:
-    """Show the progress of all work inside the block, with the time left."""
+def showing_progress(if_interrupted: str = "nothing half-written is left") -> Iterator[None]:
+    """Show the progress of all work inside the block, with the time left.
+
+    On a terminal as bars, else as a line now and then. Ctrl-C ends with status 130.
+    """
+    try:
+        with bars() if errors.is_terminal else listening(ProgressLines(say_error)):
+            yield
+    except KeyboardInterrupt:
+        say_error(f"reflfield: interrupted; {if_interrupted}")
+        raise typer.Exit(130) from None
+
+
+@contextmanager
+def bars() -> Iterator[None]:
+    """Progress bars on the terminal."""
     columns = (
         TextColumn("{task.description:<38}"),
         BarColumn(),
@@ -68,18 +89,23 @@ def progress_bars() -> Iterator[None]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=errors, transient=not errors.is_terminal) as bars:
+    with Progress(*columns, console=errors) as shown:
         tasks: dict[str, TaskID] = {}
 
         def listen(description: str, done: int, total: int) -> None:
             if done == 0 or description not in tasks:
                 if description in tasks:
-                    bars.remove_task(tasks[description])
-                tasks[description] = bars.add_task(description, total=total)
-            bars.update(tasks[description], completed=done, total=total)
+                    shown.remove_task(tasks[description])
+                tasks[description] = shown.add_task(description, total=total)
+            shown.update(tasks[description], completed=done, total=total)
 
         with listening(listen):
             yield
+
+
+def say_error(line: str) -> None:
+    """One line on standard error."""
+    errors.print(line, markup=False, soft_wrap=True)
 
 
 def say(line: str) -> None:
@@ -106,7 +132,7 @@ def demo(
     from reflfield.demo import run_demo
 
     started = time.perf_counter()
-    with progress_bars():
+    with showing_progress(GOES_ON):
         job = run_demo(out, n_workers(workers))
     say_results(job, started)
 
@@ -141,7 +167,7 @@ def run(
     resources = Resources(n_workers(workers), parse_bytes(max_memory))
     held = parse_hold_out(hold_out)
     opened = open_capture(capture, format)
-    with progress_bars():
+    with showing_progress(GOES_ON):
         job = run_pipeline(
             opened, out, options, hold_out=held, resources=resources, first=from_, last=until
         )
@@ -177,14 +203,19 @@ def relight(
 
     if (frames is None) == (orbit is None):
         raise InputError("relight: expected either --frames FRAMES or --orbit N, one of them")
+    if frames is not None and (environment or light):
+        raise InputError(
+            "--environment, --light: expected with --orbit; frames bring their own lights"
+        )
     options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
     opened = open_field(field)
-    with progress_bars():
-        if frames is not None:
-            made = relight_to(opened, frames, out, options, format)
-        else:
+    made: list[Path] = []
+    with showing_progress():
+        if orbit is not None:
             lights = turntable_lights(environment, convention, light)
-            made = orbit_to(opened, lights, out, options, orbit or 1, size, elevation)
+            made = orbit_to(opened, lights, out, options, orbit, size, elevation)
+        elif frames is not None:
+            made = relight_to(opened, frames, out, options, format)
     for path in made:
         say(str(path))
 
@@ -215,8 +246,10 @@ def turntable_lights(environment: Path | None, convention: str, light: str | Non
         direction = [float(part) for part in str(light).split(",")]
     except ValueError:
         direction = []
-    if len(direction) != 3 or not any(direction):
-        raise InputError(f"--light: expected X,Y,Z, not all zero, received {light!r}")
+    if len(direction) != 3 or not any(direction) or not np.isfinite(direction).all():
+        raise InputError(
+            f"--light: expected three finite numbers X,Y,Z, not all zero, received {light!r}"
+        )
     return Light(
         "turntable", "directional", direction=np.array(direction), intensity=np.full(3, np.pi)
     )
@@ -251,7 +284,7 @@ def compare(
 
     options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
     opened = open_field(field)
-    with progress_bars():
+    with showing_progress():
         comparison = write_standalone_comparison(
             opened, open_capture(frames, format), out, options
         )
@@ -285,11 +318,11 @@ def inspect(
 
 def n_workers(wanted: int) -> int:
     """Threads to use; 0 takes one per core that this process may use."""
-    import os
-
     if wanted < 0:
         raise InputError(f"--workers: expected 0 or more, received {wanted}")
-    return wanted or len(os.sched_getaffinity(0))
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return wanted or len(os.sched_getaffinity(0))
+    return wanted or os.cpu_count() or 1
 
 
 def pipeline_options(config: Path | None, settings: list[str]) -> Any:
@@ -303,8 +336,6 @@ def pipeline_options(config: Path | None, settings: list[str]) -> Any:
 
 def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
-    import json
-
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
         say(f"{record.name:<14}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")

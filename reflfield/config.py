@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 import tomllib
 import types
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tomli_w
 
@@ -33,7 +36,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: expected TOML, received something else: {error}") from error
 
 
@@ -52,31 +55,42 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
     Examples
     --------
-    >>> parse_settings(["hull.resolution=128", "resampling.visibility=kept"])
-    {'hull': {'resolution': 128}, 'resampling': {'visibility': 'kept'}}
+    >>> parse_settings(["hull.resolution=128", "resampling.visibility=kept", "seed=3"])
+    {'hull': {'resolution': 128}, 'resampling': {'visibility': 'kept'}, 'seed': 3}
     """
     tables: dict[str, Any] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
-        stage, dot, option = name.strip().partition(".")
-        if not (equals and dot and stage and option):
+        path = [part.strip() for part in name.split(".")]
+        if not (equals and all(path)):
             raise InputError(f"--set: expected stage.option=value, received {setting!r}")
-        tables.setdefault(stage, {})[option] = _toml_value(text.strip())
+        table: Any = _toml_value(text.strip())
+        for part in reversed(path):
+            table = {part: table}
+        tables = merged(tables, table)
     return tables
 
 
 def _toml_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
 
 
 def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of `first`, overridden option by option by `second`."""
-    result = {stage: dict(table) for stage, table in first.items()}
-    for stage, table in second.items():
-        result.setdefault(stage, {}).update(table)
+    """Tables of `first`, overridden option by option by `second`.
+
+    Examples
+    --------
+    >>> merged({"hull": {"blur": 1.0}, "seed": 1}, {"hull": {"tolerance": 2}})
+    {'hull': {'blur': 1.0, 'tolerance': 2}, 'seed': 1}
+    """
+    result = dict(first)
+    for name, value in second.items():
+        earlier = result.get(name)
+        both = isinstance(value, Mapping) and isinstance(earlier, Mapping)
+        result[name] = merged(earlier, value) if both else value  # type: ignore[arg-type]
     return result
 
 
@@ -103,14 +117,12 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
         If a name is unknown (near names are suggested) or a value has the wrong type.
     """
     hints = get_type_hints(type(options))
-    known = {f.name for f in fields(options)}  # type: ignore[arg-type]
+    known = [f.name for f in fields(options)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}
     for name, value in tables.items():
         label = f"{where}{name}"
         if name not in known:
-            raise InputError(
-                f"option {label!r}: expected one of {sorted(known)}, which this is not"
-            )
+            raise InputError(_unknown(label, name, known))
         current = getattr(options, name)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
@@ -121,38 +133,73 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
     try:
         return replace(options, **changes)  # type: ignore[type-var]
     except InputError as error:
-        raise InputError(f"{where}{error}") from error
+        raise InputError(f"option {where}{error}") from error
+
+
+def _unknown(label: str, name: str, known: list[str]) -> str:
+    near = get_close_matches(name, known, n=1)
+    remedy = f"; did you mean {near[0]!r}?" if near else ""
+    return f"option {label!r}: unknown; expected one of {', '.join(known)}{remedy}"
 
 
 def _converted(label: str, value: Any, expected: Any) -> Any:
     """Value as the annotated type, or an error that names both."""
     origin = get_origin(expected)
     if origin in (Union, types.UnionType):
-        return _first_that_fits(label, value, get_args(expected), expected)
-    if origin is tuple and isinstance(value, (list, tuple)):
-        return tuple(tuple(item) if isinstance(item, list) else item for item in value)
-    if origin is not None and origin is not tuple:
-        return value  # Literal: the dataclass checks its own words
-    if expected is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    plain = expected if isinstance(expected, type) else object
-    if isinstance(value, bool) and plain in (int, float):
-        raise InputError(f"option {label!r}: expected {plain.__name__}, received {value!r}")
-    if not isinstance(value, plain):
-        wanted = getattr(expected, "__name__", str(expected))
-        raise InputError(f"option {label!r}: expected {wanted}, received {value!r}")
+        return _first_that_fits(label, value, expected)
+    if origin is tuple:
+        return _converted_tuple(label, value, expected)
+    if origin is Literal:
+        fits = value in get_args(expected)
+    elif expected is float and _is_number(value):
+        value, fits = float(value), math.isfinite(value)
+    else:
+        # True is an int to Python, and not to those who write options.
+        fits = isinstance(value, expected) and isinstance(value, bool) == (expected is bool)
+    if not fits:
+        raise InputError(f"option {label!r}: expected {_words(expected)}, received {value!r}")
     return value
 
 
-def _first_that_fits(label: str, value: Any, choices: tuple[Any, ...], expected: Any) -> Any:
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _converted_tuple(label: str, value: Any, expected: Any) -> tuple[Any, ...]:
+    kinds = get_args(expected)
+    given = isinstance(value, (list, tuple))
+    if given and len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = kinds[:1] * len(value)
+    if not given or len(value) != len(kinds):
+        raise InputError(f"option {label!r}: expected {_words(expected)}, received {value!r}")
+    return tuple(_converted(label, v, kind) for v, kind in zip(value, kinds, strict=True))
+
+
+def _first_that_fits(label: str, value: Any, expected: Any) -> Any:
+    choices = get_args(expected)
     if value in (None, "none") and type(None) in choices:
         return None
     for choice in choices:
+        if choice is type(None):
+            continue
         try:
             return _converted(label, value, choice)
         except InputError:
             continue
-    raise InputError(f"option {label!r}: expected {expected}, received {value!r}")
+    raise InputError(f"option {label!r}: expected {_words(expected)}, received {value!r}")
+
+
+def _words(expected: Any) -> str:
+    """What a type asks for, as someone would say it who writes options."""
+    origin, inner = get_origin(expected), get_args(expected)
+    if origin is Literal:
+        return " or ".join(map(repr, inner))
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_words, inner))
+    if origin is tuple:
+        return f"a list of {', '.join('...' if i is ... else _words(i) for i in inner)}"
+    names = {bool: "true or false", int: "a whole number", float: "a finite number"}
+    return names.get(expected, {str: "text", type(None): "'none'"}.get(expected, str(expected)))
 
 
 def _without_none(table: dict[str, Any]) -> dict[str, Any]:
@@ -190,7 +237,7 @@ class Resources:
         return min(self.max_memory // 16, 256 << 20)
 
 
-_UNITS = {"": 1, "B": 1, "KB": 1 << 10, "MB": 1 << 20, "GB": 1 << 30, "TB": 1 << 40}
+_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
 def parse_bytes(text: str) -> int:
@@ -206,12 +253,14 @@ def parse_bytes(text: str) -> int:
     >>> parse_bytes("1.5GB")
     1610612736
     """
-    upper = text.strip().upper().replace("IB", "B")
-    digits = upper.rstrip("KMGTB")
+    upper = text.strip().upper().removesuffix("B").removesuffix("I")
+    digits = upper.rstrip("KMGT")
     try:
         return int(float(digits) * _UNITS[upper[len(digits) :]])
     except (ValueError, KeyError, OverflowError):
-        raise InputError(f"size: expected a number with MB or GB, received {text!r}") from None
+        raise InputError(
+            f"--max-memory: expected a number with MB or GB, such as 4GB, received {text!r}"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -249,21 +298,8 @@ def parse_hold_out(text: str) -> HoldOut:
     counts: dict[str, int] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
         name, equals, number = part.partition("=")
-        if name not in ("views", "lights") or not equals or not number.isdigit():
+        count = int(number) if re.fullmatch("[0-9]{1,9}", number) else -1
+        if name not in ("views", "lights") or not equals or count < 0 or name in counts:
             raise InputError(f"--hold-out: expected views=K,lights=K, received {text!r}")
-        counts[name] = int(number)
+        counts[name] = count
     return HoldOut(**counts)
-
-
-__all__ = [
-    "HoldOut",
-    "Resources",
-    "field",
-    "merged",
-    "parse_bytes",
-    "parse_hold_out",
-    "parse_settings",
-    "read_toml",
-    "with_tables",
-    "write_toml",
-]

@@ -7,6 +7,7 @@ see no output.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -53,3 +54,47 @@ def track(items: Iterable[Item], total: int, description: str) -> Iterator[Item]
     for done, item in enumerate(items, start=1):
         yield item
         report(description, done, total)
+
+
+class ProgressLines:
+    """Listener for logs: now and then a line with the time left.
+
+    Parameters
+    ----------
+    write : callable
+        Takes a line.
+    interval : float
+        Seconds between lines; shorter work says nothing.
+    clock : callable
+        Seconds, monotonic.
+
+    Examples
+    --------
+    >>> seconds = iter([0.0, 2.0, 6.0])
+    >>> lines = ProgressLines(print, interval=5.0, clock=lambda: next(seconds))
+    >>> for done in (0, 1, 3):
+    ...     lines("views", done, 10)
+    views: 3 of 10, 0:14 left
+    """
+
+    def __init__(
+        self,
+        write: Callable[[str], None],
+        interval: float = 5.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._write, self._interval, self._clock = write, interval, clock
+        self._started: dict[str, float] = {}
+        self._said: float | None = None
+
+    def __call__(self, description: str, done: int, total: int) -> None:
+        """Hear of progress."""
+        now = self._clock()
+        if done == 0 or description not in self._started:
+            self._started[description] = now
+        if self._said is None:
+            self._said = now
+        if 0 < done < total and now - self._said >= self._interval:
+            self._said = now
+            left = round((now - self._started[description]) * (total - done) / done)
+            self._write(f"{description}: {done} of {total}, {left // 60}:{left % 60:02d} left")
