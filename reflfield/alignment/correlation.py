@@ -296,6 +296,22 @@ def _sum_derivatives(
     out[7], out[8], out[9] = -half * half * xy, -half * half * xz, -half * half * yz
 
 
+# Loops in place of array expressions: those compile seconds of shape checks and messages.
+@numba.njit(cache=True, nogil=True)
+def copy_matrix(source: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """Entries of a 3x3 matrix into another."""
+    for i in range(3):
+        for k in range(3):
+            out[i, k] = source[i, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def scale(vector: NDArray[np.float64], n: int, factor: float) -> None:
+    """Multiply the first n entries in place."""
+    for i in range(n):
+        vector[i] *= factor
+
+
 @numba.njit(cache=True, nogil=True)
 def _newton_step(f: NDArray[np.float64], radius: float, step: NDArray[np.float64]) -> float:
     """Uphill step of at most `radius`: Newton's where concave, else damped; its length."""
@@ -317,14 +333,14 @@ def _newton_step(f: NDArray[np.float64], radius: float, step: NDArray[np.float64
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     det = xx * c0 + xy * c1 + xz * c2
     if not det > 0.0:
-        step[:] = 0.0
+        scale(step, 3, 0.0)
         return 0.0
     step[0] = (c0 * f[1] + c1 * f[2] + c2 * f[3]) / det
     step[1] = (c1 * f[1] + (xx * zz - xz * xz) * f[2] + (xy * xz - xx * yz) * f[3]) / det
     step[2] = (c2 * f[1] + (xy * xz - xx * yz) * f[2] + (xx * yy - xy * xy) * f[3]) / det
     length = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     if length > radius:
-        step *= radius / length
+        scale(step, 3, radius / length)
         length = radius
     return length
 
@@ -357,7 +373,7 @@ def _try_step(
     """Take the step, halved until the tilt is allowed; its length."""
     turned(rotation, step, trial)
     while trial[2, 2] < lowest_z and length > CONVERGED_STEP:
-        step *= 0.5
+        scale(step, 3, 0.5)
         length *= 0.5
         turned(rotation, step, trial)
     return length
@@ -397,7 +413,7 @@ def climb(
         radius = FIRST_TRUST_RADIUS
         length = 0.0
         found[i, 0] = -np.inf
-        trial[:] = rotations[i]
+        copy_matrix(rotations[i], trial)
         for _ in range(n_steps + 1):
             alpha, beta, gamma = euler_from_matrix(trial)
             fill_wigner_d(beta, row_start, recursion, edge, d)
@@ -407,7 +423,7 @@ def climb(
             if f[0] > found[i, 0]:
                 if length > 0.9 * radius:
                     radius = min(2.0 * radius, 0.5)
-                rotations[i] = trial
+                copy_matrix(trial, rotations[i])
                 # From axes turned by gamma, in which the sums are taken, to the body's own.
                 _to_body(f, gamma, found[i])
             else:
@@ -417,7 +433,7 @@ def climb(
             if length < CONVERGED_STEP:
                 # Too short to be worth an evaluation, but free to take.
                 if trial[2, 2] >= lowest_z:
-                    rotations[i] = trial
+                    copy_matrix(trial, rotations[i])
                 break
         found[i, 10] = length
 

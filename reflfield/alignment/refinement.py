@@ -23,7 +23,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.correlation import turned
+from reflfield.alignment.correlation import copy_matrix, turned
+from reflfield.alignment.correlation import scale as shrink
 from reflfield.alignment.searching import map_blocks
 from reflfield.sphere.hemisphere import first_tap, square_from_xyz
 
@@ -147,7 +148,7 @@ def _place(
         for k in range(3):
             # Turning by w about axis k moves d by w x d.
             a, b = (k + 1) % 3, (k + 2) % 3
-            other[:] = local
+            other[0], other[1], other[2] = local[0], local[1], local[2]
             other[a], other[b] = (
                 local[a] - HALF_STEP * local[b],
                 local[b] + HALF_STEP * local[a],
@@ -339,9 +340,26 @@ def _solve(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
         step[n] /= normal[n, n]
     length = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     if length > LONGEST_STEP:
-        step[:3] *= LONGEST_STEP / length
+        shrink(step, 3, LONGEST_STEP / length)
     step[3] = min(max(step[3], -0.5), 0.5)
     return bool(np.isfinite(length))
+
+
+@numba.njit(cache=True, nogil=True)
+def _turn_frame(
+    frame: NDArray[np.float64],
+    w: NDArray[np.float64],
+    turn: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """``exp(w) @ frame``; `turn` is scratch."""
+    for k in range(9):
+        out[k // 3, k % 3] = 1.0 if k % 4 == 0 else 0.0
+    turned(out, w, turn)
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = turn[r, 0] * frame[0, c] + turn[r, 1] * frame[1, c]
+            out[r, c] += turn[r, 2] * frame[2, c]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -360,13 +378,13 @@ def improve(
     v_nodes, v_places = np.zeros(len(views), np.int64), np.zeros((len(views), 8))
     l_nodes, l_places = np.zeros(len(lights), np.int64), np.zeros((len(lights), 8))
     lines = np.zeros((3, target.shape[1]), np.float32)
-    normal, step, back = np.zeros((5, 5)), np.zeros(4), np.zeros(3)
+    normal, step, turn = np.zeros((5, 5)), np.zeros(4), np.zeros((3, 3))
     frame, scale_factor = np.zeros((3, 3)), 1.0
     for i in range(samples.shape[0]):
         if brightness[i] <= 0.0:
             continue
         floor, least = relative_floor * brightness[i], np.inf
-        frame[:] = frames[i]
+        copy_matrix(frames[i], frame)
         for n in range(n_steps + 1):
             normal[:] = 0.0
             scale = brightness[i] * scale_factor if n > 0 else brightness[i]
@@ -390,16 +408,13 @@ def improve(
             cost = normal[4, 4] / max(normal[0, 4], 1e-300)
             if cost < least:
                 least = cost
-                frames[i] = frame
+                copy_matrix(frame, frames[i])
                 brightness[i] = scale
                 if not _solve(normal, step):
                     break
             else:
-                step *= 0.25
-            # frame <- exp(w) frame, written as (frame^T exp(-w))^T.
-            back[:] = -step[:3]
-            turned(frames[i].T, back, frame)
-            frame = frame.T.copy()
+                shrink(step, 4, 0.25)
+            _turn_frame(frames[i], step, turn, frame)
             scale_factor = np.exp(step[3])
 
 
