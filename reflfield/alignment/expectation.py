@@ -248,13 +248,22 @@ def seed_targets(
         for i in tries
     ]
     chosen = [int(tries[int(np.argmax(closeness))])]
-    nearest = np.full(len(sample), -1.0)
+    nearest = search(sample, sample[chosen[0] : chosen[0] + 1], margins=False, **options).score
     while len(chosen) < min(n_clusters, len(sample)):
-        last = search(sample, sample[chosen[-1] : chosen[-1] + 1], margins=False, **options)
-        nearest = np.maximum(nearest, last.score)
         distance = np.maximum(1.0 - nearest, 0.0) * weight
         distance[chosen] = 0.0
         if not distance.sum() > 0:
             break
-        chosen.append(int(rng.choice(len(sample), p=distance / distance.sum())))
+        # Of a few drawn, the one that leaves the others nearest.
+        n_drawn = min(SEEDING_TRIALS, int(np.count_nonzero(distance)))
+        tries = rng.choice(len(sample), n_drawn, False, distance / distance.sum())
+        scores = [
+            np.maximum(
+                nearest, search(sample, sample[i : i + 1], margins=False, **options).score
+            )
+            for i in tries
+        ]
+        best = int(np.argmax([weight @ score for score in scores]))
+        chosen.append(int(tries[best]))
+        nearest = scores[best]
     return sample[np.array(chosen)]
