@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture
 from reflfield.checks import check_shape
+from reflfield.errors import InputError
 from reflfield.observations.store import VIEWS_PER_CHUNK, create_samples
 from reflfield.progress import report
 
@@ -45,7 +46,7 @@ def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
     images : (n_images, h, w, 3) float32
         Linear radiance.
     pixels : (n, 2) float64
-        x and y; the centre of the top-left pixel is (0.5, 0.5).
+        x and y; the centre of the top-left pixel is (0.5, 0.5). Beyond the image, the rim.
 
     Returns
     -------
@@ -55,6 +56,8 @@ def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
     ------
     ShapeError
         If a shape is wrong.
+    InputError
+        If a pixel is NaN: the camera does not image that point.
 
     Examples
     --------
@@ -65,6 +68,12 @@ def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
     """
     check_shape("images", images, (None, None, None, 3))
     check_shape("pixels", pixels, (None, 2))
+    absent = np.isnan(pixels).any(axis=1)
+    if absent.any():
+        raise InputError(
+            f"pixels: expected numbers, received NaN in row {int(absent.argmax())}; "
+            "leave out points that the camera does not image"
+        )
     out = np.zeros((len(pixels), len(images), 3), np.float32)
     _sample_bilinear(
         np.ascontiguousarray(images, np.float32), np.ascontiguousarray(pixels, np.float64), out

@@ -47,13 +47,24 @@ class Observed:
     pairs: Bools
 
     def __post_init__(self) -> None:
+        check_shape("views", self.views, (None, None))
         check_shape("lights", self.lights, (len(self.views), None))
         check_shape("pairs", self.pairs, (self.views.shape[1], self.lights.shape[1]))
 
     def count(self) -> int:
-        """Number of samples measured."""
-        weights = self.views.astype(np.int64) @ self.pairs.astype(np.int64)
-        return int((weights * self.lights).sum())
+        """Number of samples measured.
+
+        Examples
+        --------
+        Two texels, two views, three lights; the second texel is seen from one view:
+
+        >>> views = np.array([[True, True], [True, False]])
+        >>> Observed(views, np.ones((2, 3), bool), np.ones((2, 3), bool)).count()
+        9
+        """
+        # Floats go through BLAS; the counts of views are exact in them.
+        views_of_light = self.views.astype(np.float32) @ self.pairs.astype(np.float32)
+        return int((views_of_light * self.lights).sum(dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +93,13 @@ class ObservationStore:
         return len(self.observed.views)
 
     def read(self, texels: slice | NDArray[np.integer]) -> NDArray[np.float16]:
-        """Samples (k, n_views, n_lights, 3) of some texels; unobserved ones are zero."""
+        """Samples (k, n_views, n_lights, 3) of some texels; those never written are zero.
+
+        Parameters
+        ----------
+        texels : slice or (k,) int
+            In any order, with repeats; ascending ones read each chunk once.
+        """
         array = self.samples
         if isinstance(texels, slice):
             return np.asarray(array[texels])
@@ -97,6 +114,19 @@ def create_samples(
     folder: Path, n_texels: int, n_views: int, n_lights: int, n_views_per_chunk: int
 ) -> zarr.Array:
     """Create an empty ``samples`` array; whatever the folder held is removed.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to hold the array.
+    n_texels, n_views, n_lights : int
+    n_views_per_chunk : int
+        Views that will be written together.
+
+    Returns
+    -------
+    zarr.Array
+        (n_texels, n_views, n_lights, 3) float16, all zero.
 
     Raises
     ------

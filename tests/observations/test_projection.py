@@ -1,0 +1,266 @@
+"""Photographs into texture space: half-pixel centres, irradiance, what stays zero."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reflfield.capture.cameras import Camera, looking_at
+from reflfield.capture.images import write_exr
+from reflfield.capture.lights import Light
+from reflfield.capture.model import Capture, Exposure, Photograph
+from reflfield.errors import InputError, ShapeError
+from reflfield.observations import projection
+from reflfield.observations.projection import (
+    HALF_MAX,
+    directions_of,
+    facing_irradiance,
+    pairs_photographed,
+    project_photographs,
+    sample_bilinear,
+)
+from reflfield.observations.store import ObservationStore, Observed
+
+from .rigs import dome
+
+WIDTH, HEIGHT = 8, 6
+
+
+def camera(name, height=2.0):
+    """Looks down on the plane z = 0 from above; one pixel is one metre."""
+    pose = looking_at([0, 0, height], [0, 0, 0], [0, 1, 0])
+    return Camera(name, "orthographic", WIDTH, HEIGHT, 1.0, 1.0, 4.0, 3.0, pose)
+
+
+def lamp(name, height=1.0, intensity=(1.0, 1.0, 1.0), **changes):
+    return Light(name, "point", position=[0, 0, height], intensity=intensity, **changes)
+
+
+@pytest.fixture
+def capture_of(tmp_path):
+    """Return a function from images (n_views, n_lights, h, w, 3) to a capture of them."""
+
+    def make(images, lights, missing=()):
+        photographs = []
+        for i, j in np.ndindex(images.shape[:2]):
+            if (i, j) not in missing:
+                path = tmp_path / f"v{i}_l{j}.exr"
+                write_exr(path, images[i, j].astype(np.float32))
+                photographs.append(Photograph(path.stem, i, j, (Exposure(path),)))
+        cameras = tuple(camera(f"v{i}") for i in range(len(images)))
+        return Capture("plane", tmp_path, cameras, tuple(lights), tuple(photographs))
+
+    return make
+
+
+@pytest.fixture
+def project(tmp_path):
+    """Return a function that projects and reads everything back."""
+
+    def run(capture, positions, visible=None):
+        positions = np.asarray(positions, float)
+        if visible is None:
+            visible = np.ones((len(positions), capture.n_views), bool)
+        project_photographs(capture, positions, visible, tmp_path / "store")
+        lights = np.ones((len(positions), capture.n_lights), bool)
+        observed = Observed(visible, lights, pairs_photographed(capture))
+        return ObservationStore(tmp_path / "store", observed).read(slice(None))
+
+    return run
+
+
+class TestBilinear:
+    def test_pixel_centres_return_pixels(self, rng):
+        images = rng.random((2, 3, 4, 3)).astype(np.float32)
+        y, x = np.mgrid[:3, :4]
+        centres = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+        got = sample_bilinear(images, centres)
+        assert np.array_equal(got, np.moveaxis(images.reshape(2, 12, 3), 0, 1))
+
+    def test_quarter_of_the_way(self):
+        image = np.array([[[[0.0] * 3, [4.0] * 3], [[8.0] * 3, [100.0] * 3]]], np.float32)
+        # x at 1/4, y at 1/2: 0.5 * (3/4 * 0 + 1/4 * 4) + 0.5 * (3/4 * 8 + 1/4 * 100)
+        assert sample_bilinear(image, np.array([[0.75, 1.0]]))[0, 0, 0] == 16.0
+
+    def test_plane_is_reproduced(self, rng, rounding):
+        y, x = np.mgrid[:20, :30] + 0.5
+        image = np.stack([x, y, 2 * x - 3 * y + 1], axis=-1)[None].astype(np.float32)
+        at = rng.uniform([0.5, 0.5], [29.5, 19.5], size=(500, 2))
+        got = sample_bilinear(image, at)[:, 0]
+        expected = np.stack([at[:, 0], at[:, 1], 2 * at[:, 0] - 3 * at[:, 1] + 1], axis=1)
+        assert np.abs(got - expected).max() < rounding(np.float32, 4, scale=60)
+
+    @pytest.mark.parametrize("pixel", [(-5.0, -7.0), (0.0, 0.5), (-np.inf, 0.1), (-1e300, 0)])
+    def test_beyond_the_image_is_the_rim(self, pixel, rng):
+        images = rng.random((1, 3, 4, 3)).astype(np.float32)
+        assert np.array_equal(sample_bilinear(images, np.array([pixel]))[0, 0], images[0, 0, 0])
+        far = np.array([[40.0, 1e9]])
+        assert np.array_equal(sample_bilinear(images, far)[0, 0], images[0, 2, 3])
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 3), (3, 1)])
+    def test_images_a_pixel_wide(self, shape, rng):
+        images = rng.random((1, *shape, 3)).astype(np.float32)
+        got = sample_bilinear(images, np.array([[0.5, 0.5], [9.0, 9.0]]))
+        assert np.array_equal(got[:, 0], images[0, [0, -1], [0, -1]])
+
+    def test_no_pixels(self):
+        assert sample_bilinear(np.ones((2, 3, 3, 3), np.float32), np.zeros((0, 2))).size == 0
+
+    def test_bad_input(self):
+        images = np.ones((1, 2, 2, 3), np.float32)
+        with pytest.raises(InputError, match=r"pixels: .*NaN in row 1"):
+            sample_bilinear(images, np.array([[0.0, 0.0], [0.0, np.nan]]))
+        with pytest.raises(ShapeError, match="images"):
+            sample_bilinear(images[0], np.zeros((1, 2)))
+        with pytest.raises(ShapeError, match="pixels"):
+            sample_bilinear(images, np.zeros((1, 3)))
+
+
+class TestIrradiance:
+    def test_near_point_light(self):
+        near = lamp("l0", height=2.0, intensity=[8, 4, 0])
+        # Distances 2 and sqrt(8): a quarter and an eighth of the intensity.
+        got = facing_irradiance((near,), np.array([[0, 0, 0.0], [2, 0, 0]]))
+        assert np.allclose(got[:, 0], [[2, 1, 0], [1, 0.5, 0]], rtol=1e-6)  # float32
+
+    def test_unknown_light_counts_as_one(self):
+        assert (facing_irradiance((Light("l", "unknown"),), np.zeros((2, 3))) == 1).all()
+
+
+class TestProjection:
+    def test_ramp_under_a_near_light(self, capture_of, project):
+        ramp = np.broadcast_to(np.arange(WIDTH)[:, None], (1, 1, HEIGHT, WIDTH, 3))
+        capture = capture_of(ramp, [lamp("l0", height=1.0, intensity=[1, 2, 4])])
+        # The axis hits x = 4 px, halfway between the pixels 3 and 4.
+        got = project(capture, [[0, 0, 0], [1, 0, 0], [-0.5, 0, 0]])[:, 0, 0]
+        squared_distance = np.array([1, 2, 1.25])[:, None]
+        expected = np.array([3.5, 4.5, 3.0])[:, None] * squared_distance / [1, 2, 4]
+        assert np.allclose(got, expected, rtol=2**-11)  # half floats: 11 bits
+
+    def test_image_rows_run_down(self, capture_of, project):
+        rows = np.broadcast_to(np.arange(HEIGHT)[:, None, None], (1, 1, HEIGHT, WIDTH, 3))
+        capture = capture_of(rows, [Light("l0", "directional")])
+        assert project(capture, [[0, 1, 0]])[0, 0, 0, 0] == 1.5
+
+    def test_views_and_lights_keep_their_places(self, capture_of, project, monkeypatch):
+        monkeypatch.setattr(projection, "VIEWS_PER_CHUNK", 2)
+        number = np.arange(15).reshape(5, 3)[:, :, None, None, None]
+        images = np.broadcast_to(number, (5, 3, HEIGHT, WIDTH, 3))
+        lights = [Light(f"l{j}", "directional") for j in range(3)]
+        got = project(capture_of(images, lights), [[0, 0, 0], [1, 1, 0]])
+        assert np.array_equal(got[1, ..., 0], number[..., 0, 0, 0])
+
+    def test_more_lights_than_are_read_together(self, capture_of, project):
+        number = np.arange(70)[None, :, None, None, None]
+        images = np.broadcast_to(number, (1, 70, HEIGHT, WIDTH, 3))
+        lights = [Light(f"l{j}", "directional") for j in range(70)]
+        assert np.array_equal(project(capture_of(images, lights), [[0, 0, 0]])[0, 0, :, 0],
+                              np.arange(70))  # fmt: skip
+
+    def test_unseen_and_unphotographed_stay_zero(self, capture_of, project):
+        images = np.ones((2, 2, HEIGHT, WIDTH, 3))
+        lights = [Light(f"l{j}", "directional") for j in range(2)]
+        visible = np.array([[True, True], [False, True], [False, False]])
+        got = project(capture_of(images, lights, {(1, 0)}), np.zeros((3, 3)), visible)
+        expected = visible[:, :, None] & np.array([[True, True], [False, True]])
+        assert np.array_equal(got[..., 0], expected)
+
+    def test_view_without_photographs(self, capture_of, project):
+        images = np.ones((2, 1, HEIGHT, WIDTH, 3))
+        capture = capture_of(images, [Light("l0", "directional")], {(0, 0)})
+        assert project(capture, np.zeros((1, 3)))[0, :, 0, 0].tolist() == [0, 1]
+
+    def test_light_without_blue_and_spot_that_misses(self, capture_of, project):
+        beam = {"direction": [1, 0, 0], "cone_angle": 0.1, "falloff_angle": 0.1}
+        spot = Light("l1", "spot", position=[0, 0, 1], **beam)
+        capture = capture_of(
+            np.ones((1, 2, HEIGHT, WIDTH, 3)), [lamp("l0", 1, [1, 1, 0]), spot]
+        )
+        assert project(capture, [[0, 0, 0]])[0, 0].tolist() == [[1, 1, 0], [0, 0, 0]]
+
+    def test_order_of_texels(self, capture_of, project, rng):
+        images = rng.random((2, 2, HEIGHT, WIDTH, 3))
+        capture = capture_of(images, [lamp("l0"), lamp("l1", 3.0)])
+        positions = rng.uniform(-2, 2, size=(40, 3)) * [1, 1, 0]
+        order = rng.permutation(40)
+        assert np.array_equal(project(capture, positions)[order],
+                              project(capture, positions[order]))  # fmt: skip
+
+    @pytest.mark.stability
+    @pytest.mark.parametrize("scale", [2.0**-14, 1.0, 2.0**14])
+    def test_scale_of_light_and_image_cancels(self, capture_of, project, rng, scale):
+        """Any common unit drops out: radiance over irradiance."""
+        images = rng.uniform(0.5, 1, (1, 1, HEIGHT, WIDTH, 3)).astype(np.float32)
+        positions = rng.uniform(-2, 2, size=(20, 3)) * [1, 1, 0]
+        one = project(capture_of(images, [lamp("l0")]), positions)
+        scaled = project(capture_of(images * scale, [lamp("l0", 1, [scale] * 3)]), positions)
+        assert np.array_equal(scaled, one)
+
+    @pytest.mark.stability
+    @pytest.mark.parametrize("exponent", [-13, -4, 0, 4, 14])
+    def test_samples_scale_within_the_range_of_halves(self, capture_of, project, rng, exponent):
+        """Exact for powers of two between the smallest normal half, 2^-14, and the largest."""
+        images = rng.uniform(0.5, 1, (1, 1, HEIGHT, WIDTH, 3)).astype(np.float32)
+        sun = [Light("l0", "directional")]
+        positions = rng.uniform(-2, 2, size=(20, 3))
+        one = project(capture_of(images, sun), positions).astype(np.float64)
+        scaled = project(capture_of(images * 2.0**exponent, sun), positions)
+        assert np.array_equal(scaled, one * 2.0**exponent)
+
+    @pytest.mark.stability
+    @pytest.mark.parametrize(("scale", "expected"), [(1e12, HALF_MAX), (1e-12, 0.0)])
+    def test_beyond_the_range_of_halves(self, capture_of, project, scale, expected):
+        images = np.full((1, 1, HEIGHT, WIDTH, 3), scale)
+        got = project(capture_of(images, [Light("l0", "directional")]), [[0, 0, 0]])
+        assert (got == expected).all()
+
+    def test_shapes(self, capture_of, tmp_path):
+        capture = capture_of(np.ones((1, 1, HEIGHT, WIDTH, 3)), [lamp("l0")])
+        with pytest.raises(ShapeError, match="positions"):
+            project_photographs(capture, np.zeros((2, 2)), np.ones((2, 1), bool), tmp_path)
+        with pytest.raises(ShapeError, match="visible"):
+            project_photographs(capture, np.zeros((2, 3)), np.ones((2, 3), bool), tmp_path)
+
+
+class TestDirections:
+    def test_are_unit_and_lead_to_camera_and_light(self, rng, rounding):
+        capture = dome(4, 3)
+        points = rng.normal(size=(10, 3)) * 0.3
+        views, lights = directions_of(capture, points)
+        assert views.shape == (10, 4, 3)
+        assert lights.shape == (10, 3, 3)
+        for directions, ends in (
+            (views, [c.centre for c in capture.cameras]),
+            (lights, [light.position for light in capture.lights]),
+        ):
+            towards = np.stack(ends)[None] - points[:, None]
+            cross = np.cross(directions, towards)
+            assert np.abs(cross).max() < rounding(np.float32, scale=3)
+            assert (np.sum(directions * towards, axis=2) > 0).all()
+            assert np.abs(np.linalg.norm(directions, axis=2) - 1).max() < rounding(np.float32)
+
+    def test_unknown_light_is_overhead(self):
+        capture = dome(2, 1, lights=(Light("l0", "unknown"),))
+        assert directions_of(capture, np.zeros((2, 3)))[1].tolist() == [[[0, 0, 1]]] * 2
+
+    def test_pairs(self):
+        pairs = pairs_photographed(dome(2, 3, missing={(1, 2)}))
+        assert pairs.tolist() == [[True, True, True], [True, True, False]]
+
+
+def test_large_scenes_hold_fewer_views_at_once():
+    # 10 million texels x 32 lights x 6 bytes pass 512 MB with one view.
+    assert projection._views_at_once(10_000_000, 32) == 1
+    assert projection._views_at_once(10, 32) == projection.VIEWS_PER_CHUNK
+    # 2 ** 29 / (2 ** 20 * 16 * 6) = 5.3
+    assert projection._views_at_once(1 << 20, 16) == 5
+
+
+def test_camera_that_images_nothing_is_named(capture_of, tmp_path):
+    capture = capture_of(np.ones((1, 1, HEIGHT, WIDTH, 3)), [lamp("l0")])
+    perspective = replace(capture.cameras[0], kind="opencv")
+    behind = replace(capture, cameras=(perspective,))
+    with pytest.raises(InputError, match="pixels"):
+        project_photographs(
+            behind, np.array([[0, 0, 5.0]]), np.ones((1, 1), bool), tmp_path / "s"
+        )
