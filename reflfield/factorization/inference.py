@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from reflfield.errors import ShapeError
 from reflfield.factorization.completion import Completion, map_coefficients
-from reflfield.factorization.recursive import Model
+from reflfield.factorization.recursive import Model, floored
 from reflfield.factorization.sources import as_source, reader_of
 
 
@@ -65,7 +65,8 @@ def infer_coefficients(
         offset=(completion.mean / scale).astype(reader.dtype),
         basis=completion.basis.astype(reader.dtype),
         prior_mean=np.zeros(completion.rank),
-        prior_covariance=used.T @ used / max(len(used), 1),
+        # Directions that no column used get a prior too: few rows would not determine them.
+        prior_covariance=floored(used.T @ used / max(len(used), 1)),
         noise=float(max((completion.noise / scale) ** 2, 1e-30)),
         centred=False,
         n_channels=n_channels,
