@@ -27,6 +27,7 @@ from reflfield.geometry.visibility import RayScene
 from reflfield.stages import plain, replacing, versions
 from reflfield.steps import evaluation
 from reflfield.steps.job import Job
+from reflfield.steps.standalone import metrics_text
 
 # Texels whose raw samples are averaged together for the mean texture.
 TEXELS_AT_ONCE = 1024
@@ -78,12 +79,8 @@ def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
     _write_maps(job, field, folder)
     average = average_samples(job)
     _write_mesh(job, average, folder)
-    metrics = evaluation.stored_comparison(job, "heldout") or evaluation.stored_comparison(
-        job, "truth"
-    )
-    (folder / "metrics.json").write_text(
-        json.dumps(metrics or {"frames": [], "mean": {}}, indent=2) + "\n"
-    )
+    heldout, truth = (evaluation.stored_comparison(job, name) for name in ("heldout", "truth"))
+    (folder / "metrics.json").write_text(metrics_text(heldout or truth))
     content = report_content(job, field, average)
     write_report(folder / "index.html", content)
     return {"sections": len(content.sections)}

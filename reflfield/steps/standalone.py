@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from reflfield.capture.model import Capture
 from reflfield.comparison import sections
@@ -12,6 +15,12 @@ from reflfield.comparison.report import ReportContent, write_report
 from reflfield.field.model import ReflectanceField
 from reflfield.relighting.renderer import RenderOptions
 from reflfield.stages import replacing
+
+
+def metrics_text(compared: Mapping[str, Any] | None) -> str:
+    """Text of ``metrics.json``: every frame and the mean, nothing beside them."""
+    kept = {"frames": [], "mean": {}} if compared is None else compared
+    return json.dumps({name: kept[name] for name in ("frames", "mean")}, indent=2) + "\n"
 
 
 def write_standalone_comparison(
@@ -34,7 +43,7 @@ def write_standalone_comparison(
     """
     comparison, pairs = compare_with_photographs(field, frames, out / "relit", options)
     with replacing(out / "metrics.json") as partial:
-        partial.write_text(comparison.to_json())
+        partial.write_text(metrics_text(comparison.to_dict()))
     (out / "report").mkdir(exist_ok=True)
     content = ReportContent(
         title=f"{field.metadata.get('capture', 'field')} against {frames.name}",

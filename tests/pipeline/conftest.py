@@ -1,0 +1,183 @@
+"""A tiny simulated capture, a finished run of it, and the command in this process."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from capture_sim.scene import parse_scene
+from capture_sim.write import write_capture
+from reflfield.cli import main
+
+# A satin ball seen by 10 cameras of 32 x 32 pixels under 6 lights: a run takes seconds.
+SCENE = {
+    "name": "tiny",
+    "object": {"preset": "sphere", "radius": 0.05},
+    "material": {"preset": "satin"},
+    "cameras": {
+        "preset": "rings",
+        "elevations_deg": [-30, 10, 50],
+        "counts": [3, 4, 3],
+        "offsets_deg": [0, 30, 0],
+        "distance": 0.5,
+        "extent": 0.13,
+        "width": 32,
+        "height": 32,
+    },
+    "lights": {
+        "preset": "rings",
+        "elevations_deg": [10, 60],
+        "counts": [4, 2],
+        "distance": 0.6,
+    },
+    "image": {"samples_per_side": 1, "edge_samples_per_side": 2},
+    "heldout": {"frames": 2},
+    "truth": {"points": 20},
+}
+OPTIONS = """
+[hull]
+resolution = 32
+n_triangles = 2000
+[atlas]
+resolution = 64
+[resampling]
+view_side = 5
+light_side = 5
+[completion]
+rank = 4
+passes = 1
+[alignment]
+band_limit = 4
+iterations = 1
+n_clusters = 1
+[compression]
+n_clusters = 2
+n_components = 2
+rank = 4
+[compression.samples]
+rounds = 1
+iterations = 2
+[relighting]
+samples_per_pixel = 1
+"""
+HELD_OUT = ("--hold-out", "views=1,lights=1")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left: exit status, standard output, standard error."""
+
+    status: int
+    out: str
+    err: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run of the tiny capture by the installed command."""
+
+    folder: Path
+    outcome: Outcome
+
+
+@pytest.fixture(scope="session")
+def tiny_capture(tmp_path_factory):
+    """Folder of the simulated capture. Read only."""
+    return write_capture(parse_scene(SCENE), tmp_path_factory.mktemp("captures") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def tiny_options(tmp_path_factory):
+    """TOML file of options that make a run short."""
+    path = tmp_path_factory.mktemp("options") / "options.toml"
+    path.write_text(OPTIONS)
+    return path
+
+
+@pytest.fixture(scope="session")
+def subprocess_run():
+    """Function that runs a Python command line in a process of its own."""
+
+    def run(*words, **kwargs):
+        done = subprocess.run(
+            [sys.executable, *map(str, words)],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=250,
+            **kwargs,
+        )
+        return Outcome(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory, tiny_capture, tiny_options, subprocess_run):
+    """The whole run, once a session. Read only: copy it to change it."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    outcome = subprocess_run(
+        *("-m", "reflfield.cli", "run", tiny_capture, "-o", folder),
+        *("--config", tiny_options, *HELD_OUT),
+    )
+    assert outcome.status == 0, outcome.err
+    return Run(folder, outcome)
+
+
+@pytest.fixture
+def run_copy(finished, tmp_path):
+    """A finished run to change."""
+    return shutil.copytree(finished.folder, tmp_path / "run")
+
+
+@pytest.fixture
+def capture_copy(tiny_capture, tmp_path):
+    """A capture to damage, without its truth."""
+    return shutil.copytree(
+        tiny_capture, tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
+    )
+
+
+@pytest.fixture
+def described():
+    """Function that changes the description of a capture in place."""
+
+    def change(folder, edit):
+        path = folder / "capture.json"
+        document = json.loads(path.read_text())
+        edit(document)
+        path.write_text(json.dumps(document))
+
+    return change
+
+
+@pytest.fixture
+def reflfield(monkeypatch, capsys):
+    """Function that runs ``reflfield WORDS`` in this process."""
+
+    def command(*words):
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "argv", ["reflfield", *map(str, words)])
+        status = 0
+        try:
+            main()
+        except SystemExit as end:
+            status = int(end.code or 0)
+        shown = capsys.readouterr()
+        return Outcome(status, shown.out, shown.err)
+
+    return command
+
+
+@pytest.fixture
+def run_tiny(reflfield, tiny_capture, tiny_options):
+    """Function that runs the tiny capture, or a copy of it, into a folder."""
+
+    def run(out, *words, capture=tiny_capture):
+        return reflfield("run", capture, "-o", out, "--config", tiny_options, *HELD_OUT, *words)
+
+    return run

@@ -1,0 +1,202 @@
+"""A whole run: what it leaves, what it skips, what it computes again."""
+
+import hashlib
+import json
+import shutil
+import tomllib
+
+import numpy as np
+import pytest
+import trimesh
+
+from reflfield.capture.images import read_image
+from reflfield.config import merged
+from reflfield.field.evaluation import evaluate
+from reflfield.field.file import open_field
+from reflfield.geometry.mesh import read_ply
+from reflfield.pipeline import STAGES
+from reflfield.steps.options import PipelineOptions
+
+FILES = (
+    "field.rfld",
+    "hull.ply",
+    "atlas.glb",
+    "normals.exr",
+    "tangents.exr",
+    "report/index.html",
+    "metrics.json",
+    "timings.json",
+    "options.toml",
+)
+
+
+def digest(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def digests(folder):
+    """SHA-256 of every file; times and what was skipped differ from run to run."""
+    return {
+        str(path.relative_to(folder)): digest(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "timings.json"
+    }
+
+
+def states(folder):
+    """Which stages the last run took over."""
+    records = json.loads((folder / "timings.json").read_text())["stages"]
+    return {record["name"]: record["reused"] for record in records}
+
+
+class TestWhatARunLeaves:
+    def test_the_files_named(self, finished):
+        assert [name for name in FILES if not (finished.folder / name).is_file()] == []
+
+    def test_nothing_half_written(self, finished):
+        assert [p for p in finished.folder.rglob("*") if "partial" in p.name] == []
+
+    def test_field_opens_and_answers(self, finished):
+        field = open_field(finished.folder / "field.rfld")
+        up = np.array([[0.0, 0.0, 1.0]])
+        normal = field.local_from_world[:1, 2].astype(float)
+        facing = evaluate(field, np.array([0], np.int32), normal, normal)
+        assert field.n_texels > 500
+        assert field.metadata["capture"] == "tiny"
+        assert np.isfinite(facing).all()
+        assert (facing > 0).all()
+        assert np.isfinite(evaluate(field, np.array([0], np.int32), normal, -up)).all()
+
+    def test_hull_is_closed_and_as_large_as_the_ball(self, finished):
+        mesh = read_ply(finished.folder / "hull.ply")
+        assert mesh.watertight
+        radius = np.linalg.norm(mesh.vertices, axis=1)
+        # A pixel covers 4 mm; a hull of few views stands out between them.
+        assert radius.min() > 0.045
+        assert radius.max() < 0.075
+
+    def test_atlas_opens_in_another_library(self, finished):
+        loaded = trimesh.load(finished.folder / "atlas.glb", force="mesh")
+        assert len(loaded.faces) == len(read_ply(finished.folder / "hull.ply").faces)
+        assert loaded.visual.uv.min() >= 0
+        assert loaded.visual.uv.max() <= 1
+
+    @pytest.mark.parametrize("name", ["normals.exr", "tangents.exr"])
+    def test_maps_hold_unit_vectors_where_there_are_texels(self, finished, name):
+        field = open_field(finished.folder / "field.rfld")
+        image = read_image(finished.folder / name)
+        covered = field.texel_of_pixel >= 0
+        lengths = np.linalg.norm(image[covered], axis=1)
+        # The field stores frames as quantised quaternions, and re-normalises them.
+        np.testing.assert_allclose(lengths, 1, atol=1e-4)
+        np.testing.assert_array_equal(image[~covered], 0)
+
+    def test_metrics_have_the_documented_keys(self, finished):
+        metrics = json.loads((finished.folder / "metrics.json").read_text())
+        measured = {"psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
+        assert set(metrics) == {"frames", "mean"}
+        assert [set(frame) for frame in metrics["frames"]] == [{"name"} | measured]
+        assert set(metrics["mean"]) == measured
+        assert metrics["frames"][0]["name"].startswith("v")
+
+    def test_timings_name_every_stage_with_memory_and_size(self, finished):
+        timings = json.loads((finished.folder / "timings.json").read_text())
+        assert [stage["name"] for stage in timings["stages"]] == list(STAGES)
+        assert all(stage["size_bytes"] > 0 for stage in timings["stages"])
+        assert all(stage["peak_bytes"] > 1 << 20 for stage in timings["stages"])
+        assert {"reflfield", "numpy", "python"} <= set(timings["versions"])
+
+    def test_options_are_those_used(self, finished, tiny_options):
+        used = tomllib.loads((finished.folder / "options.toml").read_text())
+        asked = tomllib.loads(tiny_options.read_text())
+        assert merged(used, asked) == used
+        assert used["seed"] == PipelineOptions().seed
+
+    def test_report_is_one_page_by_itself(self, finished):
+        page = (finished.folder / "report" / "index.html").read_text()
+        assert "<html" in page
+        assert 'src="data:image' in page
+        assert 'src="http' not in page
+        assert "Held-out photographs" in page
+
+    def test_results_on_stdout_and_nothing_on_stderr(self, finished):
+        assert str(finished.folder / "field.rfld") in finished.outcome.out.splitlines()
+        assert "PSNR" in finished.outcome.out
+        # No warning of a library, and no progress: every step took less than an interval.
+        assert "arning" not in finished.outcome.err
+
+
+class TestSecondRun:
+    def test_skips_every_stage_and_leaves_the_same_bytes(self, run_copy, run_tiny):
+        before = digests(run_copy)
+        outcome = run_tiny(run_copy)
+        assert outcome.status == 0
+        assert states(run_copy) == dict.fromkeys(STAGES, True)
+        assert digests(run_copy) == before
+
+    def test_capture_may_have_moved(self, run_copy, run_tiny, tiny_capture, tmp_path):
+        moved = shutil.copytree(tiny_capture, tmp_path / "elsewhere")
+        run_tiny(run_copy, capture=moved)
+        assert all(states(run_copy).values())
+
+    def test_threads_do_not_change_the_field(self, finished, run_copy, run_tiny):
+        outcome = run_tiny(run_copy, "--from", "silhouettes", "--workers", "3")
+        assert outcome.status == 0
+        assert not any(states(run_copy).values())
+        assert digest(run_copy / "field.rfld") == digest(finished.folder / "field.rfld")
+
+    @pytest.mark.parametrize(
+        ("setting", "first"),
+        [
+            ("visibility.grazing_cosine=0.3", "visibility"),
+            ("alignment.iterations=2", "alignment"),
+            ("compression.n_clusters=1", "compression"),
+            ("relighting.samples_per_pixel=4", "comparison"),
+        ],
+    )
+    def test_a_changed_option_computes_again_from_its_stage(
+        self, run_copy, run_tiny, setting, first
+    ):
+        outcome = run_tiny(run_copy, "--set", setting)
+        assert outcome.status == 0, outcome.err
+        assert [stage for stage, reused in states(run_copy).items() if not reused] == list(
+            STAGES[STAGES.index(first) :]
+        )
+
+    def test_relighting_options_leave_the_field_as_it_would_be_anew(
+        self, finished, run_copy, run_tiny
+    ):
+        run_tiny(run_copy, "--set", "relighting.samples_per_pixel=4", "--from", "compression")
+        assert digest(run_copy / "field.rfld") == digest(finished.folder / "field.rfld")
+
+    def test_a_changed_photograph_computes_again_from_the_observations(
+        self, run_copy, run_tiny, tiny_capture, tmp_path
+    ):
+        changed = shutil.copytree(tiny_capture, tmp_path / "changed")
+        photographs = changed / "photographs"
+        shutil.copy(photographs / "v000_l000.exr", photographs / "v000_l001.exr")
+        assert run_tiny(run_copy, "--until", "observations", capture=changed).status == 0
+        assert [s for s, reused in states(run_copy).items() if not reused] == ["observations"]
+
+    def test_from_computes_again_what_has_not_changed(self, run_copy, run_tiny):
+        before = digest(run_copy / "field.rfld")
+        run_tiny(run_copy, "--from", "compression")
+        again = [stage for stage, reused in states(run_copy).items() if not reused]
+        assert again == ["compression", "comparison", "report"]
+        assert digest(run_copy / "field.rfld") == before
+
+    def test_until_stops_there(self, run_tiny, tmp_path):
+        outcome = run_tiny(tmp_path / "part", "--until", "hull")
+        assert outcome.status == 0
+        assert list(states(tmp_path / "part")) == ["silhouettes", "hull"]
+        assert (tmp_path / "part" / "hull.ply").is_file()
+        assert not (tmp_path / "part" / "field.rfld").exists()
+
+    def test_a_deleted_stage_is_computed_again_alone(self, run_copy, run_tiny):
+        before = digests(run_copy / "stages" / "visibility")
+        shutil.rmtree(run_copy / "stages" / "visibility")
+        run_tiny(run_copy)
+        assert [s for s, reused in states(run_copy).items() if not reused] == ["visibility"]
+        again = digests(run_copy / "stages" / "visibility")
+        del before["stage.json"], again["stage.json"]  # holds times
+        assert again == before
