@@ -50,6 +50,7 @@ light_side = 5
 [completion]
 rank = 4
 passes = 1
+training_texels = 200
 [alignment]
 band_limit = 4
 iterations = 1
@@ -58,6 +59,7 @@ n_clusters = 1
 n_clusters = 2
 n_components = 2
 rank = 4
+training_texels = 200
 [compression.samples]
 rounds = 1
 iterations = 2
