@@ -20,6 +20,8 @@ from reflfield.errors import InputError
 Options = TypeVar("Options")
 # A configuration file is written by hand: anything larger is another file.
 LARGEST_FILE = 1 << 20
+# Libraries and code take 0.4 GB before the first photograph is read.
+LEAST_MEMORY = 1 << 30
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -225,16 +227,27 @@ class Resources:
     def __post_init__(self) -> None:
         if self.workers < 1:
             raise InputError(f"--workers: expected at least 1, received {self.workers}")
-        if self.max_memory < 1 << 30:
+        if self.max_memory < LEAST_MEMORY:
             raise InputError(
-                f"--max-memory: expected at least 1GB, received {self.max_memory} bytes: "
-                "the libraries alone take half of that"
+                f"--max-memory: expected at least {gigabytes(LEAST_MEMORY)}, received "
+                f"{gigabytes(self.max_memory)}: the libraries alone take half of that"
             )
 
     @property
     def block_bytes(self) -> int:
         """Working memory for one block of texels."""
         return min(self.max_memory // 16, 256 << 20)
+
+
+def gigabytes(size: float) -> str:
+    """Bytes for messages.
+
+    Examples
+    --------
+    >>> gigabytes(1610612736)
+    '1.5 GB'
+    """
+    return f"{size / 2**30:.1f} GB"
 
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}

@@ -13,6 +13,9 @@ from reflfield.geometry.visibility import VisibilityOptions
 from reflfield.observations.resampling import ResamplingOptions
 from reflfield.relighting.renderer import RenderOptions
 
+# Side of the smallest texture that is chosen, texels.
+SMALLEST_TEXTURE = 64
+
 
 @dataclass(frozen=True)
 class TextureOptions:
@@ -33,6 +36,10 @@ class TextureOptions:
         if not self.texels_per_pixel > 0:
             raise InputError(
                 f"texels_per_pixel: expected > 0, received {self.texels_per_pixel}"
+            )
+        if self.largest < SMALLEST_TEXTURE:
+            raise InputError(
+                f"largest: expected at least {SMALLEST_TEXTURE}, received {self.largest}"
             )
 
 
@@ -97,6 +104,9 @@ class AlignmentOptions:
     least_margin: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("band_limit", "iterations", "n_clusters"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
         if not 0 < self.max_tilt_deg <= 180:
             raise InputError(f"max_tilt_deg: expected (0, 180], received {self.max_tilt_deg}")
 
@@ -121,3 +131,7 @@ class PipelineOptions:
     compression: CompressionOptions = field(default_factory=CompressionOptions)
     relighting: RenderOptions = field(default_factory=RenderOptions)
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError(f"seed: expected 0 or more, received {self.seed}")

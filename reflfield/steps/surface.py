@@ -23,6 +23,7 @@ from reflfield.geometry.visibility import (
 from reflfield.progress import track
 from reflfield.stages import plain
 from reflfield.steps.job import Job
+from reflfield.steps.options import SMALLEST_TEXTURE
 
 
 def write_silhouettes(job: Job, folder: Path) -> dict[str, Any]:
@@ -98,7 +99,8 @@ def derived_resolution(job: Job, mesh: Mesh) -> int:
     if not texel > 0:
         raise GeometryError("cameras: expected the object in front of most, found it behind")
     side = np.sqrt(mesh.area / TYPICAL_USE) / texel
-    return int(np.clip(np.ceil(side / 16) * 16, 64, job.options.texture.largest))
+    side = np.clip(np.ceil(side / 16) * 16, SMALLEST_TEXTURE, job.options.texture.largest)
+    return int(side)
 
 
 def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
