@@ -9,9 +9,10 @@ Writers write to a temporary name first and rename, so a killed run leaves no ha
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -424,6 +425,8 @@ def _exr_channels(path: Path) -> dict[str, Float32]:
         _check_size(path, *(int(n) for n in high - low + 1))
     with (
         _named(path, "an OpenEXR image"),
+        # Of a damaged file OpenEXR prints a warning besides failing: the error says it.
+        redirect_stdout(io.StringIO()),
         OpenEXR.File(str(path), separate_channels=True) as file,
     ):
         return {
