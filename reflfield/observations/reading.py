@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.model import Capture
-from reflfield.observations.projection import directions_of
+from reflfield.observations.projection import directions_of, facing_irradiance
 from reflfield.observations.resampling import (
     Nodes,
     ResamplingOptions,
@@ -83,14 +83,17 @@ class TexelReader:
 
     def rooted(self, texels: Indices) -> RootedSamples:
         """Samples (in the domain), taps and weights of some texels."""
-        views, lights = directions_of(self.capture, self.positions[texels])
+        positions = self.positions[texels]
+        views, lights = directions_of(self.capture, positions)
+        # Outside a spot's cone the sample says nothing, though no shadow falls there.
+        lit = facing_irradiance(self.capture.lights, positions).any(axis=2)
         observed = self.store.observed
         samples = TexelSamples(
             samples=self.store.read(texels),
             views=views,
             lights=lights,
             view_seen=observed.views[texels],
-            light_seen=observed.lights[texels],
+            light_seen=observed.lights[texels] & lit,
             pairs=observed.pairs,
         )
         frames = np.ascontiguousarray(self.local_from_world[texels], np.float32)

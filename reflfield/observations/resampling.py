@@ -16,7 +16,6 @@ A node counts as observed as far as directions actually seen lie near it
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -94,7 +93,13 @@ def side_for(n_directions: int) -> int:
 
 
 def root(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
-    """Samples into the domain of the factorization; the sign is kept."""
+    """Samples into the domain of the factorization; the sign is kept.
+
+    Examples
+    --------
+    >>> root(np.array([8.0, -8.0]), "cube_root"), root(np.array([9.0, -9.0]), "square_root")
+    (array([ 2., -2.]), array([ 3., -3.]))
+    """
     if domain == "linear":
         return values
     if domain == "cube_root":
@@ -103,7 +108,13 @@ def root(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
 
 
 def unroot(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
-    """Inverse of `root`."""
+    """Inverse of `root`.
+
+    Examples
+    --------
+    >>> unroot(np.array([2.0, -2.0]), "cube_root"), unroot(np.array([-3.0]), "square_root")
+    (array([ 8., -8.]), array([-9.]))
+    """
     if domain == "linear":
         return values
     if domain == "cube_root":
@@ -112,14 +123,21 @@ def unroot(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
 
 
 @lru_cache(maxsize=16)
-def prior_covariance(side: int, smoothness: float) -> Floats:
+def prior_covariance(side: int, smoothness: float) -> NDArray[np.float64]:
     """Covariance (n_nodes, n_nodes) of a smooth function on a hemisphere grid.
 
     The inverse of ``smoothness * (sum of squared differences between neighbours)
     + 1e-3 * smoothness``, in units of a sample's variance.
+
+    Examples
+    --------
+    Two by two nodes: a constant has variance 1000 / 4 at each node, smoothness 1.
+
+    >>> prior_covariance(2, 1.0).mean().round(3)
+    np.float64(250.0)
     """
     if side == 1:
-        return np.full((1, 1), 1e3 / smoothness, np.float32)
+        return np.full((1, 1), 1e3 / smoothness, np.float64)
     node = np.arange(side * side).reshape(side, side)
     first = np.concatenate([node[:, :-1].ravel(), node[:-1].ravel()])
     second = np.concatenate([node[:, 1:].ravel(), node[1:].ravel()])
@@ -127,7 +145,7 @@ def prior_covariance(side: int, smoothness: float) -> Floats:
     rows = np.arange(len(first))
     difference[rows, first], difference[rows, second] = 1.0, -1.0
     precision = smoothness * (difference.T @ difference + 1e-3 * np.eye(side * side))
-    return np.linalg.solve(precision, np.eye(side * side)).astype(np.float32)
+    return np.linalg.solve(precision, np.eye(side * side)).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +158,20 @@ class Nodes:
         In the domain, without the light's cosine; smooth continuation where not observed.
     view_support, light_support : (n, n_nodes) float32
         Share in [0, 1] to which each node was observed.
+    pair_support : (n, n_view_nodes, n_light_nodes) float32, optional
+        Summed interpolation weight of the pairs photographed; None where all were.
     """
 
     values: Floats
     view_support: Floats
     light_support: Floats
+    pair_support: Floats | None = None
 
     @property
     def weights(self) -> Floats:
         """(n, n_view_nodes, n_light_nodes) share to which each pair of nodes is observed."""
-        return self.view_support[:, :, None] * self.light_support[:, None, :]
+        product = self.view_support[:, :, None] * self.light_support[:, None, :]
+        return product if self.pair_support is None else np.minimum(product, self.pair_support)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +199,16 @@ class TexelSamples:
 
 
 def local_directions(local_from_world: Floats, directions: Floats) -> Floats:
-    """Directions (n, k, 3) of the world in the texels' frames (n, 3, 3)."""
+    """Directions (n, k, 3) of the world in the texels' frames (n, 3, 3).
+
+    Examples
+    --------
+    A frame whose normal is +x of the world:
+
+    >>> frame = np.array([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]], np.float32)
+    >>> local_directions(frame, np.array([[[1, 0, 0]]], np.float32))
+    array([[[0., 0., 1.]]], dtype=float32)
+    """
     return directions @ np.swapaxes(local_from_world, 1, 2)
 
 
@@ -225,6 +256,11 @@ def rooted_samples(
     Returns
     -------
     RootedSamples
+
+    Notes
+    -----
+    Views below `LOWEST_VIEW` and lights more than half the softened band below the
+    texel's horizon do not count, where the direction varies.
     """
     view = local_directions(local_from_world, texels.views)
     light = local_directions(local_from_world, texels.lights)
@@ -233,14 +269,16 @@ def rooted_samples(
     if sides[1] > 1:
         cosine = softened_cosine(light[..., 2]).astype(np.float32)
         light_seen = light_seen & (light[..., 2] > -0.5 * HORIZON_SOFTNESS)
-    view_seen = texels.view_seen & (view[..., 2] > LOWEST_VIEW) if sides[0] > 1 else None
+    view_seen = texels.view_seen
+    if sides[0] > 1:
+        view_seen = view_seen & (view[..., 2] > LOWEST_VIEW)
     safe = np.where(light_seen, cosine, np.float32(1.0))
     ratio = texels.samples.astype(np.float32) / safe[:, None, :, None]
     return RootedSamples(
         values=root(ratio, domain),
         view_taps=direction_taps(view, sides[0]),
         light_taps=direction_taps(light, sides[1]),
-        view_weights=(texels.view_seen if view_seen is None else view_seen).astype(np.float32),
+        view_weights=view_seen.astype(np.float32),
         light_weights=light_seen * safe ** np.float32(2.0 / POWERS[domain]),
         pairs=texels.pairs.astype(np.float32),
     )
@@ -271,7 +309,8 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
     Notes
     -----
     Two solves of the size of the number of views and of lights per texel. Pairs that
-    were never photographed are filled from the fit, `FILLING_SWEEPS` times.
+    were never photographed are filled from the fit, `FILLING_SWEEPS` times, and count as
+    observed only as far as photographed ones lie near them.
     """
     from_views, view_support = _operator(
         rooted.view_taps, rooted.view_weights, sides[0], smoothness
@@ -279,21 +318,55 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
     from_lights, light_support = _operator(
         rooted.light_taps, rooted.light_weights, sides[1], smoothness
     )
-    values = rooted.values
-    missing = rooted.pairs == 0
+    if rooted.pairs.all():
+        nodes = apply_both(from_views, from_lights, rooted.values)
+        return Nodes(nodes, view_support, light_support)
     to_views = interpolation_matrices(rooted.view_taps, sides[0])
     to_lights = interpolation_matrices(rooted.light_taps, sides[1])
-    if missing.any():
-        values = np.where(missing[None, :, :, None], np.float32(0), values)
-        for _ in range(FILLING_SWEEPS):
-            nodes = apply_both(from_views, from_lights, values)
-            fitted = apply_both(to_views, to_lights, nodes)
-            values = np.where(missing[None, :, :, None], fitted, values)
-    return Nodes(apply_both(from_views, from_lights, values), view_support, light_support)
+    photographed = (rooted.pairs > 0)[None, :, :, None]
+    values = np.where(photographed, rooted.values, _means(rooted)[:, None, None])
+    for _ in range(FILLING_SWEEPS):
+        nodes = apply_both(from_views, from_lights, values)
+        values = np.where(photographed, values, apply_both(to_views, to_lights, nodes))
+    nodes = apply_both(from_views, from_lights, values)
+    support = _pair_support(rooted, to_views, to_lights)
+    return Nodes(nodes, view_support, light_support, support)
+
+
+def _means(rooted: RootedSamples) -> Floats:
+    """Weighted mean (n, 3) of each texel's samples: where the filling starts."""
+    weights = rooted.view_weights[:, :, None] * rooted.pairs * rooted.light_weights[:, None]
+    total = np.einsum("tij,tijc->tc", weights, rooted.values)
+    return total / np.maximum(weights.sum(axis=(1, 2)), np.float32(1e-6))[:, None]
+
+
+def _pair_support(rooted: RootedSamples, to_views: Floats, to_lights: Floats) -> Floats:
+    """Interpolation weight (n, n_view_nodes, n_light_nodes) of the pairs photographed."""
+    seen = (rooted.view_weights > 0)[:, :, None] & (rooted.light_weights > 0)[:, None]
+    counted = (seen * rooted.pairs)[..., None]
+    support = apply_both(np.swapaxes(to_views, 1, 2), np.swapaxes(to_lights, 1, 2), counted)
+    return np.where(support < LEAST_SUPPORT, np.float32(0), support)[..., 0]
 
 
 def apply_both(left: Floats, right: Floats, values: Floats) -> Floats:
-    """Products left @ values @ right^T for each texel and channel."""
+    """Products left @ values @ right^T for each texel and channel.
+
+    Parameters
+    ----------
+    left : (n, a, b) float32
+    right : (n, c, d) float32
+    values : (n, b, d, n_channels) float32
+
+    Returns
+    -------
+    (n, a, c, n_channels) float32
+
+    Examples
+    --------
+    >>> left, right = np.ones((1, 1, 2)), np.full((1, 1, 3), 10.0)
+    >>> apply_both(left, right, np.ones((1, 2, 3, 1))).ravel()
+    array([60.])
+    """
     n, a, b, c = values.shape
     halfway = (left @ values.reshape(n, a, b * c)).reshape(n, -1, b, c)
     # (n, nodes, b, c) -> contract b by batched GEMM with channels folded into rows.
@@ -302,7 +375,16 @@ def apply_both(left: Floats, right: Floats, values: Floats) -> Floats:
 
 
 def interpolation_matrices(taps: tuple[NDArray[np.int32], Floats], side: int) -> Floats:
-    """Dense interpolation matrices (n, k, n_nodes)."""
+    """Dense interpolation matrices (n, k, n_nodes) of taps (n, k, 4).
+
+    Examples
+    --------
+    >>> zenith = np.array([[[0, 0, 1]]], np.float32)
+    >>> interpolation_matrices(direction_taps(zenith, 3), 3).reshape(3, 3)
+    array([[0., 0., 0.],
+           [0., 1., 0.],
+           [0., 0., 0.]], dtype=float32)
+    """
     nodes, weights = taps
     n, k, _ = nodes.shape
     dense = np.zeros((n * k, side * side), np.float32)
@@ -315,23 +397,19 @@ def interpolation_matrices(taps: tuple[NDArray[np.int32], Floats], side: int) ->
 def _operator(
     taps: tuple[NDArray[np.int32], Floats], weights: Floats, side: int, smoothness: float
 ) -> tuple[Floats, Floats]:
-    """Matrices (n, n_nodes, k) from samples to nodes, and the nodes' support."""
+    """Matrices (n, n_nodes, k) from samples to nodes, and the nodes' support.
+
+    A constant may vary 1e5 times as much as a sample: in float32 the solve would lose
+    three of seven digits.
+    """
     interpolation = interpolation_matrices(taps, side)
-    covariance = prior_covariance(side, smoothness)
     half = np.sqrt(weights)[:, :, None]
-    weighted = interpolation * half
-    spread = weighted @ covariance
-    system = spread @ np.swapaxes(weighted, 1, 2) + np.eye(weights.shape[1], dtype=np.float32)
-    operator = np.swapaxes(np.linalg.solve(system, spread), 1, 2)
+    weighted = (interpolation * half).astype(np.float64)
+    spread = weighted @ prior_covariance(side, smoothness)
+    system = spread @ np.swapaxes(weighted, 1, 2)
+    diagonal = np.arange(weights.shape[1])
+    system[:, diagonal, diagonal] += 1.0
+    operator = np.linalg.solve(system, spread).astype(np.float32)
     support = np.minimum((interpolation * (weights > 0)[:, :, None]).sum(axis=1), 1.0)
     support[support < LEAST_SUPPORT] = 0.0
-    return operator * np.swapaxes(half, 1, 2), support.astype(np.float32)
-
-
-def texel_blocks(
-    n_texels: int, bytes_per_texel: int, budget: int = 128 << 20
-) -> Iterator[slice]:
-    """Slices of texels of which a block's working memory stays below `budget` bytes."""
-    step = int(np.clip(budget // max(bytes_per_texel, 1), 16, 4096))
-    for first in range(0, n_texels, step):
-        yield slice(first, min(first + step, n_texels))
+    return np.swapaxes(operator * half, 1, 2), support.astype(np.float32)

@@ -1,0 +1,162 @@
+"""Texels in chosen frames: the store, the directions and the resampling put together."""
+
+import numpy as np
+import pytest
+
+from reflfield.capture.lights import Light
+from reflfield.observations.projection import pairs_photographed
+from reflfield.observations.reading import NodeColumns, TexelReader, grid_sides
+from reflfield.observations.resampling import ResamplingOptions, root
+from reflfield.observations.store import ObservationStore, Observed, create_samples
+from reflfield.sphere.hemisphere import HemisphereGrid
+
+from .rigs import dome, tilted_frames
+
+SIDES = (3, 5)
+
+
+@pytest.fixture
+def reader_of(tmp_path, rng):
+    """Return a function from a capture and samples to a reader of them."""
+
+    def make(capture, samples, *, domain="linear", sides=SIDES, **observed):
+        n = len(samples)
+        stored = create_samples(tmp_path / "store", n, capture.n_views, capture.n_lights, 8)
+        stored[:] = samples.astype(np.float16)
+        seen = {
+            "views": np.ones((n, capture.n_views), bool),
+            "lights": np.ones((n, capture.n_lights), bool),
+            "pairs": pairs_photographed(capture),
+        }
+        return TexelReader(
+            store=ObservationStore(tmp_path / "store", Observed(**(seen | observed))),
+            capture=capture,
+            positions=rng.uniform(-0.1, 0.1, size=(n, 3)),
+            local_from_world=tilted_frames(rng, n),
+            sides=sides,
+            options=ResamplingOptions(domain=domain),
+        )
+
+    return make
+
+
+@pytest.fixture
+def reader(reader_of, rng):
+    return reader_of(dome(6, 7), rng.random((40, 6, 7, 3)))
+
+
+class TestSides:
+    def test_follow_the_counts(self):
+        assert grid_sides(dome(12, 32), ResamplingOptions()) == (5, 7)
+        assert grid_sides(dome(12, 32), ResamplingOptions(view_side=4, light_side=9)) == (4, 9)
+
+    def test_what_does_not_vary_gets_one(self):
+        chosen = ResamplingOptions(view_side=9, light_side=9)
+        assert grid_sides(dome(1, 1), chosen) == (1, 1)
+        unknown = tuple(Light(f"l{i}", "unknown") for i in range(3))
+        assert grid_sides(dome(6, 3, lights=unknown), chosen) == (9, 1)
+
+
+class TestReader:
+    def test_values_are_samples_over_cosines(self, reader, rng):
+        texels = np.array([31, 4])
+        got = reader.rooted(texels)
+        stored = reader.store.read(texels).astype(float)
+        for i, t in enumerate(texels):
+            for j, light in enumerate(reader.capture.lights):
+                towards = light.position - reader.positions[t]
+                normal = reader.local_from_world[t, 2]
+                cosine = normal @ towards / np.linalg.norm(towards)
+                if cosine > 0.1:  # above the softened band
+                    assert np.allclose(got.values[i, :, j], stored[i, :, j] / cosine, rtol=1e-5)
+                    assert np.isclose(got.light_weights[i, j], cosine**2, rtol=1e-5)
+
+    def test_what_is_not_observed_has_no_weight(self, reader_of, rng):
+        lights = rng.random((9, 4)) < 0.5
+        views = rng.random((9, 5)) < 0.5
+        capture = dome(5, 4, missing={(2, 3)})
+        reader = reader_of(capture, rng.random((9, 5, 4, 3)), views=views, lights=lights)
+        texels = np.array([8, 1, 3, 5])
+        got = reader.rooted(texels)
+        assert np.array_equal(got.view_weights > 0, views[texels])
+        assert not got.light_weights[~lights[texels]].any()
+        assert got.pairs.sum() == 19
+        assert got.pairs[2, 3] == 0
+
+    def test_spots_that_miss_say_nothing(self, reader_of, rng):
+        """A texel outside the cone is dark for a reason that is not its reflectance."""
+        aimed = {"position": [0, 0, 2], "cone_angle": 0.3, "falloff_angle": 0.3}
+        lights = (
+            Light("l0", "spot", direction=[0, 0, -1], **aimed),
+            Light("l1", "spot", direction=[1, 0, 0], **aimed),
+        )
+        reader = reader_of(dome(3, 2, lights=lights), rng.random((4, 3, 2, 3)))
+        assert (reader.rooted(np.arange(4)).light_weights > 0).tolist() == [[True, False]] * 4
+
+    def test_unknown_light(self, reader_of, rng):
+        samples = rng.random((5, 6, 1, 3))
+        capture = dome(6, 1, lights=(Light("l0", "unknown"),))
+        reader = reader_of(capture, samples, domain="cube_root", sides=(5, 1))
+        got = reader.rooted(np.arange(5))
+        stored = samples.astype(np.float16).astype(np.float32)
+        assert np.array_equal(got.values, root(stored, "cube_root"))
+        assert (got.light_weights == 1).all()
+        assert reader.nodes(np.arange(5)).values.shape == (5, 25, 1, 3)
+
+    def test_frames_turn_the_nodes(self, reader_of, rng):
+        """A function of the local light alone is found again in any frames."""
+        capture = dome(4, 120)
+        flat = reader_of(capture, np.zeros((10, 4, 120, 3)), sides=(1, 3))
+        local = flat.rooted(np.arange(10))
+        slope = HemisphereGrid(3).directions @ [0.3, 0.2, 0.0] + 1
+        nodes, weights = local.light_taps
+        values = (slope[nodes] * weights).sum(axis=2)
+        towards = np.stack([light.directions(flat.positions) for light in capture.lights], 1)
+        cosine = np.einsum("nlx,nx->nl", towards, flat.local_from_world[:, 2])
+        samples = np.repeat((values * cosine)[:, None, :, None], 4, axis=1).repeat(3, axis=3)
+        reader = reader_of(capture, np.maximum(samples, 0), sides=(1, 3))
+        reader = reader.rotated(flat.local_from_world)
+        object.__setattr__(reader, "positions", flat.positions)
+        found = reader.nodes(np.arange(10))
+        seen = found.light_support > 0.9
+        # Halves, the smoothness demanded (0.03 against some ten samples a node).
+        assert np.abs(found.values[:, 0, :, 0] - slope)[seen].max() < 0.05
+        turned = reader.rotated(np.roll(flat.local_from_world, 1, axis=1))
+        # The normal is now another axis: the function is not found.
+        other = turned.nodes(np.arange(10))
+        assert np.abs(other.values[:, 0, :, 0] - slope)[other.light_support > 0.9].max() > 0.2
+
+    def test_sizes(self, reader):
+        assert reader.n_texels == 40
+        assert reader.n_pairs == 9 * 25
+        values = reader.rooted(np.arange(40)).values.nbytes
+        assert reader.sample_bytes_per_texel * 40 > values
+
+
+class TestColumns:
+    def test_rows_are_pairs_of_nodes_and_channels(self, reader):
+        columns = NodeColumns(reader, np.array([7, 30, 2]))
+        assert columns.shape == (9 * 25 * 3, 3)
+        values, weights = columns.read(np.array([2, 0]))
+        nodes = reader.nodes(np.array([2, 7]))
+        assert np.array_equal(values.T.reshape(2, 9, 25, 3), nodes.values)
+        assert np.array_equal(weights.T.reshape(2, 9, 25), nodes.weights)
+
+    def test_order_repeats_and_blocks(self, reader, rng):
+        columns = NodeColumns(reader, rng.permutation(40))
+        values, weights = columns.read(np.arange(40))
+        order = np.concatenate([rng.permutation(40), [3, 3]])
+        for part in np.array_split(order, 5):
+            some, shares = columns.read(part)
+            assert np.array_equal(some, values[:, part])
+            assert np.array_equal(shares, weights[:, part])
+
+    @pytest.mark.stability
+    def test_texel_that_nothing_sees(self, reader_of, rng):
+        views = np.ones((3, 6), bool)
+        views[1] = False
+        reader = reader_of(dome(6, 7), rng.random((3, 6, 7, 3)), views=views)
+        values, weights = NodeColumns(reader, np.arange(3)).read(np.arange(3))
+        assert np.isfinite(values).all()
+        assert not values[:, 1].any()
+        assert weights.any(axis=0).tolist() == [True, False, True]
