@@ -1,0 +1,155 @@
+"""The command itself: help at once, results on stdout, progress on stderr, exit statuses."""
+
+import re
+import resource
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+import reflfield as package
+import reflfield.cli as cli
+from reflfield.progress import ProgressLines, listening, report
+
+COMMANDS = ("demo", "run", "relight", "compare", "inspect")
+
+
+class TestHelp:
+    @pytest.mark.parametrize("words", [(), *((command,) for command in COMMANDS)])
+    def test_names_what_there_is(self, reflfield, words):
+        outcome = reflfield(*words, "--help")
+        assert outcome.status == 0
+        assert outcome.err == ""
+        assert f"reflfield {' '.join(words)}".strip() in outcome.out
+        expected = COMMANDS if not words else ("Options",)
+        assert all(word in outcome.out for word in expected)
+
+    def test_run_lists_the_options_of_the_readme(self, reflfield):
+        text = reflfield("run", "--help").out
+        for option in ("--config", "--set", "--hold-out", "--from", "--until", "--workers"):
+            assert option in text
+        assert "--max-memory" in text
+
+    def test_version(self, reflfield):
+        assert reflfield("--version").out == f"reflfield {package.__version__}\n"
+
+    @pytest.mark.parametrize("words", [("--help",), ("run", "--help"), ("--version",)])
+    def test_answers_before_the_libraries_are_loaded(self, words):
+        # Processor time, not wall time: other work on the machine must not fail this.
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        command = [sys.executable, "-m", "reflfield.cli", *words]
+        subprocess.run(command, check=True, capture_output=True, timeout=60)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = (after.ru_utime - before.ru_utime) + (after.ru_stime - before.ru_stime)
+        assert spent < 1.5
+
+
+class TestExitStatus:
+    @pytest.mark.parametrize(
+        "words", [("fly",), ("run",), ("run", "capture"), ("run", "--wings")]
+    )
+    def test_usage_ends_with_2(self, reflfield, words):
+        outcome = reflfield(*words)
+        assert outcome.status == 2
+        assert outcome.out == ""
+        assert "Usage" in outcome.err
+
+    def test_interruption_ends_with_130(self, reflfield, tiny_capture, tmp_path, monkeypatch):
+        def interrupted(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("reflfield.steps.surface.visual_hull", interrupted)
+        outcome = reflfield("run", tiny_capture, "-o", tmp_path / "out")
+        assert outcome.status == 130
+        assert outcome.out == ""
+        assert outcome.err.splitlines() == [f"reflfield: interrupted; {cli.GOES_ON}"]
+        stages = tmp_path / "out" / "stages"
+        assert {p.name for p in stages.iterdir()} == {".lock", "silhouettes"}
+
+    def test_a_defect_keeps_its_traceback(self, reflfield, tiny_capture, monkeypatch, tmp_path):
+        def broken(*_, **__):
+            raise KeyError("defect")
+
+        monkeypatch.setattr("reflfield.steps.surface.visual_hull", broken)
+        with pytest.raises(KeyError, match="defect"):
+            reflfield("run", tiny_capture, "-o", tmp_path / "out")
+        assert not (tmp_path / "out" / "stages" / "hull.partial").exists()
+
+
+class TestProgress:
+    def test_lines_say_how_much_is_left_and_not_too_often(self):
+        times = iter([0.0, 3.0, 6.0, 7.0, 12.0, 20.0])
+        lines = []
+        with listening(ProgressLines(lines.append, interval=5.0, clock=lambda: next(times))):
+            for done in range(5):
+                report("views", done, 4)
+            report("lights", 0, 3)
+        # Half done after 6 s; the last step says nothing: what follows tells.
+        assert lines == ["views: 2 of 4, 0:06 left"]
+
+    def test_goes_to_stderr(self, reflfield, finished, tiny_capture, tmp_path, monkeypatch):
+        monkeypatch.setattr(
+            cli, "ProgressLines", lambda write: ProgressLines(write, interval=0.0)
+        )
+        outcome = reflfield(
+            *("relight", finished.folder / "field.rfld", "-o", tmp_path / "out"),
+            *("--frames", tiny_capture / "truth" / "heldout.json", "--samples", "1"),
+        )
+        assert outcome.status == 0
+        assert re.search(r"relighting: 1 of 2, 0:\d\d left", outcome.err)
+        assert "left" not in outcome.out
+
+
+class TestRelight:
+    def test_frames(self, reflfield, finished, tiny_capture, tmp_path):
+        frames, out = tiny_capture / "truth" / "heldout.json", tmp_path / "out"
+        field = finished.folder / "field.rfld"
+        outcome = reflfield("relight", field, "--frames", frames, "-o", out, "--samples", "1")
+        assert outcome.status == 0
+        assert outcome.out.splitlines() == [str(out / f"h00{i}.exr") for i in (0, 1)]
+        assert {p.name for p in out.iterdir()} == {
+            f"h00{i}.{kind}" for i in (0, 1) for kind in ("exr", "png")
+        }
+
+    def test_orbit(self, reflfield, finished, tmp_path):
+        out = tmp_path / "out"
+        outcome = reflfield(
+            *("relight", finished.folder / "field.rfld", "-o", out, "--orbit", "2"),
+            *("--light", "1,0,1", "--samples", "1", "--size", "32"),
+        )
+        assert outcome.status == 0
+        made = outcome.out.splitlines()
+        assert len(made) == 2
+        assert all((tmp_path / name).is_file() for name in made)
+        assert len(list(out.rglob("*.png"))) >= 2
+
+    def test_field_alone_is_enough(self, reflfield, finished, tiny_capture, tmp_path):
+        field = shutil.copy(finished.folder / "field.rfld", tmp_path / "moved.rfld")
+        frames = tiny_capture / "truth" / "heldout.json"
+        words = ("--frames", frames, "-o", tmp_path / "out", "--samples", "1")
+        assert reflfield("relight", field, *words).status == 0
+
+
+def test_compare_prints_and_writes_metrics(reflfield, finished, tiny_capture, tmp_path):
+    out, frames = tmp_path / "out", tiny_capture / "truth" / "heldout.json"
+    field = finished.folder / "field.rfld"
+    outcome = reflfield("compare", field, frames, "-o", out, "--samples", "1")
+    assert outcome.status == 0
+    assert "2 frames: PSNR" in outcome.out
+    assert (out / "metrics.json").is_file()
+    assert (out / "report" / "index.html").is_file()
+
+
+@pytest.mark.parametrize("what", ["capture", "field", "frames"])
+def test_inspect_counts(reflfield, finished, tiny_capture, what):
+    paths = {
+        "capture": tiny_capture,
+        "field": finished.folder / "field.rfld",
+        "frames": tiny_capture / "truth" / "heldout.json",
+    }
+    outcome = reflfield("inspect", paths[what])
+    assert outcome.status == 0
+    assert outcome.err == ""
+    expected = {"capture": ("10", "60"), "field": ("cube_root", "factored"), "frames": ("2",)}
+    assert all(re.search(rf"\b{word}\b", outcome.out) for word in expected[what])
