@@ -19,6 +19,8 @@ from reflfield.progress import report
 Floats = NDArray[np.float32]
 # Largest half float; a mirror-like peak beyond it is held there.
 HALF_MAX = 65504.0
+# Lights sampled together: the pixel positions are worked out once for all of them.
+LIGHTS_AT_ONCE = 32
 
 
 @numba.njit(cache=True, nogil=True)
@@ -92,6 +94,7 @@ def project_photographs(
     positions: NDArray[np.floating],
     visible: NDArray[np.bool_],
     folder: Path,
+    budget: int = 512 << 20,
 ) -> None:
     """Write the samples of all texels: radiance divided by the light's irradiance.
 
@@ -105,6 +108,9 @@ def project_photographs(
         True where the camera sees the texel; other samples stay zero.
     folder : Path
         Store to create.
+    budget : int
+        Bytes for the samples of the views, and for the photographs, held at a time. The
+        samples do not depend on it.
 
     Raises
     ------
@@ -115,12 +121,12 @@ def project_photographs(
 
     Notes
     -----
-    Every photograph is read once. A chunk's worth of views is held at a time:
-    ``VIEWS_PER_CHUNK * n_texels * n_lights * 6`` bytes.
+    Every photograph is read once. A chunk's worth of views is held at a time,
+    ``VIEWS_PER_CHUNK * n_texels * n_lights * 6`` bytes, or fewer by `budget`; one at least.
     """
     check_shape("positions", positions, (None, 3))
     check_shape("visible", visible, (len(positions), capture.n_views))
-    group = _views_at_once(len(positions), capture.n_lights)
+    group = _views_at_once(len(positions), capture.n_lights, budget)
     store = create_samples(folder, len(positions), capture.n_views, capture.n_lights, group)
     points = np.asarray(positions, np.float64)
     report("projecting photographs", 0, capture.n_views)
@@ -129,25 +135,29 @@ def project_photographs(
         block = np.zeros((len(points), len(views), capture.n_lights, 3), np.float16)
         for i, view in enumerate(views):
             seen = np.flatnonzero(visible[:, view])
-            for lights, values in _view_samples(capture, view, points[seen]):
+            for lights, values in _view_samples(capture, view, points[seen], budget):
                 block[seen[:, None], i, lights] = values
             report("projecting photographs", view + 1, capture.n_views)
         store[:, views.start : views.stop] = block
 
 
-def _views_at_once(n_texels: int, n_lights: int) -> int:
-    """Views whose samples are held together: a chunk's, fewer if they pass 512 MB."""
-    fits = (512 << 20) // max(n_texels * n_lights * 6, 1)
+def _views_at_once(n_texels: int, n_lights: int, budget: int) -> int:
+    """Views whose samples are held together: a chunk's, fewer if they pass the budget."""
+    fits = budget // max(n_texels * n_lights * 6, 1)
     return int(min(max(fits, 1), VIEWS_PER_CHUNK))
 
 
 def _view_samples(
-    capture: Capture, view: int, points: NDArray[np.float64]
+    capture: Capture, view: int, points: NDArray[np.float64], budget: int
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float16]]]:
     """Samples of one view, some lights at a time: (lights, (n_points, n, 3))."""
     pixels, _ = capture.cameras[view].project(points)
     photographed = np.flatnonzero(capture.photograph_index[view] >= 0)
-    for lights in np.array_split(photographed, max(1, -(-len(photographed) // 32))):
+    camera = capture.cameras[view]
+    # A photograph with the copies made of it while reading, and its samples.
+    each = 12 * (3 * camera.width * camera.height + 4 * len(points))
+    together = int(np.clip(budget // max(each, 1), 1, LIGHTS_AT_ONCE))
+    for lights in np.array_split(photographed, max(1, -(-len(photographed) // together))):
         if not len(lights):
             continue
         indices = capture.photograph_index[view, lights]
