@@ -19,6 +19,8 @@ from reflfield.progress import report
 Floats = NDArray[np.float32]
 # Largest half float; a mirror-like peak beyond it is held there.
 HALF_MAX = 65504.0
+# Bytes for the samples, and for the photographs, that are held at a time.
+BUDGET = 512 << 20
 # Lights sampled together: the pixel positions are worked out once for all of them.
 LIGHTS_AT_ONCE = 32
 
@@ -94,7 +96,7 @@ def project_photographs(
     positions: NDArray[np.floating],
     visible: NDArray[np.bool_],
     folder: Path,
-    budget: int = 512 << 20,
+    budget: int = BUDGET,
 ) -> None:
     """Write the samples of all texels: radiance divided by the light's irradiance.
 
@@ -141,7 +143,7 @@ def project_photographs(
         store[:, views.start : views.stop] = block
 
 
-def _views_at_once(n_texels: int, n_lights: int, budget: int) -> int:
+def _views_at_once(n_texels: int, n_lights: int, budget: int = BUDGET) -> int:
     """Views whose samples are held together: a chunk's, fewer if they pass the budget."""
     fits = budget // max(n_texels * n_lights * 6, 1)
     return int(min(max(fits, 1), VIEWS_PER_CHUNK))
