@@ -17,6 +17,7 @@ from reflfield.errors import InputError
 from reflfield.stages import only_run
 from reflfield.steps import evaluation, outputs, reflectance, surface
 from reflfield.steps.job import Job
+from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
 
 STAGES = (
@@ -81,6 +82,7 @@ def run(
         )
     options = options or PipelineOptions()
     job = Job(capture, out, options, hold_out or HoldOut(), resources or Resources(), redo)
+    check_memory(job)
     training, key = job.training, job.stages.key
 
     def stage(

@@ -26,6 +26,7 @@ from reflfield.comparison.truth import (
     open_truth,
     surface_points,
 )
+from reflfield.config import Resources
 from reflfield.field.file import open_field
 from reflfield.field.model import ReflectanceField
 from reflfield.observations.resampling import (
@@ -35,6 +36,7 @@ from reflfield.observations.resampling import (
     local_directions,
     unroot,
 )
+from reflfield.relighting.renderer import RenderOptions
 from reflfield.sphere.hemisphere import softened_cosine
 from reflfield.steps.job import Job
 
@@ -45,7 +47,7 @@ MATCH_SPACINGS = 2.0
 def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
     """Relight held-out frames and measure them; without any, say so."""
     field = open_field(job.stages.root / "compression" / "field.rfld")
-    options = replace(job.options.relighting, workers=job.resources.workers)
+    options = within_memory(job.options.relighting, job.resources)
     counts: dict[str, Any] = {"frames": 0}
     for name, frames in frame_sets(job).items():
         comparison, _ = compare_with_photographs(field, frames, folder / name, options)
@@ -53,6 +55,19 @@ def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
         counts["frames"] += len(frames.photographs)
         counts[f"{name} PSNR, dB"] = comparison.mean["psnr_ldr"]
     return counts
+
+
+# Memory of one ray through a pixel: hits, footprints of up to twelve texels, radiance.
+RAY_BYTES = 4096
+
+
+def within_memory(options: RenderOptions, resources: Resources) -> RenderOptions:
+    """Blocks of pixels that all threads together can work on; the pictures stay the same."""
+    each = RAY_BYTES * options.samples_per_pixel
+    fits = max(4 * resources.block_bytes // (resources.workers * each), 64)
+    return replace(
+        options, workers=resources.workers, block_pixels=min(options.block_pixels, fits)
+    )
 
 
 def frame_sets(job: Job) -> dict[str, Capture]:

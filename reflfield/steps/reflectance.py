@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.alignment import Alignment, align
+from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
 from reflfield.factorization.inference import infer_coefficients
 from reflfield.field.compression import cluster_completed, fill_unobserved
@@ -22,11 +24,12 @@ from reflfield.field.model import (
     build_field,
 )
 from reflfield.observations.projection import project_photographs
-from reflfield.observations.reading import NodeColumns, TexelReader
+from reflfield.observations.reading import TexelReader
 from reflfield.observations.resampling import unroot
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain, versions
+from reflfield.steps.columns import BlockedColumns, half_columns
 from reflfield.steps.job import Job, load_arrays
 
 Floats = NDArray[np.float32]
@@ -38,7 +41,8 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 def write_observations(job: Job, folder: Path) -> dict[str, Any]:
     """Apparent BRDF samples of all texels, on disk."""
-    project_photographs(job.training, job.texels.position, job.view_seen, folder)
+    budget = 2 * job.resources.block_bytes
+    project_photographs(job.training, job.texels.position, job.view_seen, folder, budget)
     store = job.base_reader.store
     return {
         "photographs": len(job.training.photographs),
@@ -60,6 +64,8 @@ def write_completion(job: Job, folder: Path) -> dict[str, Any]:
         passes=options.passes,
         method=options.method,
         seed=job.options.seed,
+        resources=job.resources,
+        scratch=folder,
     )
     write_completion_arrays(folder / "completion.npz", found, coefficients)
     return {
@@ -80,8 +86,13 @@ def completed(
     passes: int = 4,
     method: Literal["map", "brand"] = "map",
     seed: int = 0,
+    resources: Resources | None = None,
+    scratch: Path | None = None,
 ) -> tuple[Completion, Floats]:
     """Completion shaped by the chosen texels, and coefficients of all.
+
+    The columns of the chosen texels are kept in memory, or in a temporary folder inside
+    `scratch` where they are too many; the result depends on neither.
 
     Returns
     -------
@@ -89,52 +100,29 @@ def completed(
     coefficients : (n_texels, rank) float32
         Zero (the mean) for texels without samples.
     """
-    columns = _InMemory.read_from(NodeColumns(reader, chosen))
-    found = complete(
-        columns,
-        rank=rank,
-        passes=passes,
-        method=method,
-        n_channels=3,
-        seed=seed,
-    )
+    resources = resources or Resources()
+    block_bytes = resources.block_bytes
+    with TemporaryDirectory(dir=scratch, prefix="columns.") as folder:
+        found = complete(
+            half_columns(
+                BlockedColumns(reader, chosen, block_bytes),
+                resources.max_memory // 4,
+                Path(folder),
+            ),
+            rank=rank,
+            passes=passes,
+            method=method,
+            n_channels=3,
+            seed=seed,
+        )
     coefficients = np.zeros((reader.n_texels, found.rank), np.float32)
     coefficients[chosen] = found.coefficients
     others = np.setdiff1d(seen, chosen)
     if len(others):
         coefficients[others], _ = infer_coefficients(
-            found, NodeColumns(reader, others), n_channels=3
+            found, BlockedColumns(reader, others, block_bytes), n_channels=3
         )
     return found, coefficients
-
-
-@dataclass(frozen=True, eq=False)
-class _InMemory:
-    """Columns that several passes read, as halves."""
-
-    values: NDArray[np.float16]
-    weights: NDArray[np.float16]
-
-    @classmethod
-    def read_from(cls, source: NodeColumns) -> _InMemory:
-        rows, n = source.shape
-        values = np.zeros((n, rows), np.float16)
-        weights = np.zeros((n, rows // 3), np.float16)
-        for first in range(0, n, source.run_length):
-            part = np.arange(first, min(first + source.run_length, n))
-            block, share = source.read(part)
-            values[part], weights[part] = block.T, share.T
-        return cls(values, weights)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.values.shape[1], self.values.shape[0]
-
-    def read(self, columns: Indices) -> tuple[Floats, Floats]:
-        return (
-            self.values[columns].T.astype(np.float32),
-            self.weights[columns].T.astype(np.float32),
-        )
 
 
 def write_completion_arrays(path: Path, found: Completion, coefficients: Floats) -> None:
@@ -248,7 +236,7 @@ def write_compression(job: Job, folder: Path) -> dict[str, Any]:
     """Raw samples in the aligned frames -> clusters, mean, basis, coefficients -> field."""
     stored = job.result("alignment", "alignment.npz")
     frames = local_frames(job, stored["local_from_base"])
-    model = fitted_model(job, job.base_reader.rotated(frames))
+    model = fitted_model(job, job.base_reader.rotated(frames), folder)
     made = field_of(job, model, frames)
     write_field(folder / "field.rfld", made)
     np.savez(folder / "model.npz", residuals=np.array(model.residuals))
@@ -269,7 +257,7 @@ def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
     return (local_from_base @ job.texels.local_from_world).astype(np.float32)
 
 
-def fitted_model(job: Job, reader: TexelReader) -> ClusteredModel:
+def fitted_model(job: Job, reader: TexelReader, scratch: Path) -> ClusteredModel:
     """Clusters, mean, basis and coefficients in the reader's frames."""
     options = job.options.compression
     seen = job.seen_texels
@@ -279,6 +267,8 @@ def fitted_model(job: Job, reader: TexelReader) -> ClusteredModel:
         seen,
         rank=options.rank,
         seed=job.options.seed,
+        resources=job.resources,
+        scratch=scratch,
     )
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)

@@ -1,0 +1,144 @@
+"""The ceiling of memory sizes the blocks, changes no result, and may be refused."""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reflfield.capture.readers import open_capture
+from reflfield.config import HoldOut, Resources, read_toml, with_tables
+from reflfield.errors import InputError
+from reflfield.field.file import open_field
+from reflfield.observations.projection import project_photographs
+from reflfield.observations.store import ObservationStore
+from reflfield.relighting.renderer import Renderer, RenderOptions
+from reflfield.steps.columns import BlockedColumns, half_columns, texels_at_once
+from reflfield.steps.evaluation import within_memory
+from reflfield.steps.job import Job
+from reflfield.steps.memory import check_memory, least_memory
+from reflfield.steps.options import PipelineOptions, TextureOptions
+
+GB = 1 << 30
+
+
+@pytest.fixture(scope="module")
+def job(finished, tiny_capture, tiny_options):
+    """The finished run, to read from."""
+    options = with_tables(PipelineOptions(), read_toml(tiny_options))
+    return Job(open_capture(tiny_capture), finished.folder, options, HoldOut(1, 1))
+
+
+class TestColumns:
+    @pytest.mark.parametrize("at_once", [1, 7, 100])
+    def test_do_not_depend_on_the_block(self, job, at_once):
+        texels = job.seen_texels[::3][:100]
+        columns = np.random.default_rng(0).permutation(len(texels))
+        whole = BlockedColumns(job.base_reader, texels, GB).read(columns)
+        tight = BlockedColumns(job.base_reader, texels, 1)
+        assert texels_at_once(job.base_reader, 1) == 1
+        parts = [tight.read(part) for part in np.array_split(columns, -(-100 // at_once))]
+        for i in range(2):
+            joined = np.concatenate([part[i] for part in parts], axis=1)
+            np.testing.assert_array_equal(joined, whole[i])
+
+    def test_are_the_same_from_files(self, job, tmp_path):
+        texels = job.seen_texels[:300]
+        source = BlockedColumns(job.base_reader, texels, GB)
+        (tmp_path / "held").mkdir()
+        in_memory = half_columns(source, GB, tmp_path / "held")
+        in_files = half_columns(source, 0, tmp_path)
+        assert list((tmp_path / "held").iterdir()) == []
+        n_bytes = 300 * (source.shape[0] + source.shape[0] // 3) * 2
+        assert sum(p.stat().st_size for p in tmp_path.iterdir() if p.is_file()) == n_bytes
+        columns = np.array([299, 0, 256, 5])
+        for one, other in zip(in_memory.read(columns), in_files.read(columns), strict=True):
+            np.testing.assert_array_equal(one, other)
+        exact, _ = source.read(columns)
+        # Halves: 11 bits.
+        np.testing.assert_allclose(in_files.read(columns)[0], exact, rtol=2**-11, atol=1e-7)
+
+
+def test_projection_does_not_depend_on_the_budget(job, tmp_path):
+    project_photographs(job.training, job.texels.position, job.view_seen, tmp_path / "s", 1)
+    tight = ObservationStore(tmp_path / "s", job.observed).samples
+    ample = job.base_reader.store.samples
+    # One view at a time instead of a chunk's worth.
+    assert tight.chunks[1] == 1 < ample.chunks[1]
+    np.testing.assert_array_equal(tight[:], ample[:])
+
+
+def test_pictures_do_not_depend_on_the_block(job, finished):
+    options = RenderOptions(samples_per_pixel=4, workers=2)
+    tight = replace(options, block_pixels=64)
+    capture, field = job.capture, open_field(finished.folder / "field.rfld")
+    one, other = (
+        Renderer(field, o).render(capture.cameras[4], capture.lights[2])
+        for o in (options, tight)
+    )
+    assert one.image.max() > 0
+    np.testing.assert_array_equal(one.image, other.image)
+    np.testing.assert_array_equal(one.coverage, other.coverage)
+
+
+def test_blocks_of_pixels_follow_ceiling_and_threads():
+    options = RenderOptions(samples_per_pixel=16, block_pixels=4096)
+    ample = within_memory(options, Resources(workers=2, max_memory=8 * GB))
+    tight = within_memory(options, Resources(workers=16, max_memory=GB))
+    assert ample.block_pixels == 4096
+    assert 64 <= tight.block_pixels < 1024
+    assert tight.workers == 16
+
+
+class TestCeiling:
+    @pytest.mark.parametrize("ceiling", ["1GB", "8GB"])
+    def test_changes_no_byte_and_holds(self, finished, run_copy, run_tiny, ceiling):
+        again = ("--from", "observations", "--until", "compression", "--max-memory", ceiling)
+        assert run_tiny(run_copy, *again).status == 0
+        one, other = (
+            hashlib.sha256((folder / "field.rfld").read_bytes()).hexdigest()
+            for folder in (run_copy, finished.folder)
+        )
+        assert one == other
+
+    def test_holds(self, finished):
+        # The default is 4 GB; what the libraries take is most of what this capture needs.
+        timings = json.loads((finished.folder / "timings.json").read_text())
+        assert timings["max_memory"] == 4 * GB
+        assert 100 << 20 < timings["peak_bytes"] < GB
+
+    def test_estimate_bounds_what_a_small_run_takes(self, job, finished):
+        tight = replace(job, resources=Resources(1, GB))
+        timings = json.loads((finished.folder / "timings.json").read_text())
+        assert timings["peak_bytes"] < least_memory(tight) + (128 << 20)
+        check_memory(tight)
+
+    def test_estimate_grows_with_texels_and_pixels(self, job):
+        larger = PipelineOptions(texture=TextureOptions(largest=4096))
+        cameras = tuple(replace(c, width=4000, height=3000) for c in job.capture.cameras)
+        big = replace(job.capture, cameras=cameras)
+        assert least_memory(replace(job, options=larger)) > least_memory(job) + GB
+        # 9 views of 12 million pixels at 5 bytes, one photograph at 36.
+        assert least_memory(replace(job, capture=big)) > least_memory(job) + 900e6
+
+    def test_too_low_is_refused(self, job):
+        larger = PipelineOptions(texture=TextureOptions(largest=4096))
+        tight = replace(job, options=larger, resources=Resources(1, GB))
+        with pytest.raises(
+            InputError, match=r"--max-memory: expected at least \d.\d GB .* 9 v"
+        ):
+            check_memory(tight)
+
+    def test_what_is_asked_for_suffices(self, job):
+        larger = PipelineOptions(texture=TextureOptions(largest=4096))
+        tight = replace(job, options=larger, resources=Resources(1, GB))
+        check_memory(replace(tight, resources=Resources(1, least_memory(tight) * 17 // 16)))
+
+    def test_refusal_by_the_command_makes_nothing(self, reflfield, tiny_capture, tmp_path):
+        words = ("--max-memory", "1GB", "--set", "texture.largest=8192")
+        outcome = reflfield("run", tiny_capture, "-o", tmp_path / "out", *words)
+        assert outcome.status == 2
+        assert "--max-memory: expected at least" in outcome.err
+        assert "received 1.0 GB" in outcome.err
+        assert not (tmp_path / "out").exists()
