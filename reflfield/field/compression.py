@@ -7,7 +7,7 @@ result is that of local PCA on the completed columns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,12 @@ from reflfield.field.fit import ClusteredModel, SampleFitOptions
 from reflfield.field.model import Quantisation
 
 Floats = NDArray[np.float32]
+
+# Samples that a texel must have on average for each coefficient to be fitted to them.
+SAMPLES_PER_COEFFICIENT = 4
+
+# Noise and coefficients have at least this share of the largest variance of a coefficient.
+LEAST_SPREAD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,8 @@ class CompressionOptions:
     fit : {"auto", "samples", "grid"}
         "grid": local PCA of the resampled texels, as in the paper. "samples": from there,
         mean, basis and coefficients are fitted to the samples themselves. "auto" fits to
-        the samples where a texel has fewer of them than the grids have nodes.
+        the samples where a texel has fewer of them than the grids have nodes, but several
+        for each coefficient.
     rank : int
         Rank of the completion in the aligned frames.
     training_texels : int
@@ -60,9 +67,15 @@ class CompressionOptions:
                     f"{name}: expected at least {least}, received {getattr(self, name)}"
                 )
 
-    def fits_samples(self, n_samples: int, n_pairs: int) -> bool:
-        """Whether to fit to the samples, of which a texel has at most `n_samples`."""
-        return self.fit == "samples" or (self.fit == "auto" and n_samples < n_pairs)
+    def fits_samples(self, n_samples: float, n_pairs: int) -> bool:
+        """Whether to fit to the samples, of which a texel has `n_samples` on average.
+
+        On dense domes the grids lose nothing; with a few samples a texel, its
+        coefficients would follow their errors.
+        """
+        enough = SAMPLES_PER_COEFFICIENT * self.n_components
+        sparse = enough <= n_samples < n_pairs
+        return self.fit == "samples" or (self.fit == "auto" and sparse)
 
 
 def cluster_completed(
@@ -106,7 +119,9 @@ def cluster_completed(
         cluster=np.zeros(len(coefficients), np.int32),
         coefficients=np.zeros((len(coefficients), n_components), np.float32),
         table=np.ascontiguousarray(table, np.float32),
-        precision=_precision(local.labels, local.coefficients, completion.noise),
+        precision=_precision(
+            local.labels, local.coefficients, completion.noise, local.n_clusters
+        ),
     )
     model.cluster[observed] = local.labels
     model.coefficients[observed] = local.coefficients
@@ -114,17 +129,25 @@ def cluster_completed(
 
 
 def _precision(
-    labels: NDArray[np.int32], coefficients: NDArray[np.floating], noise: float
+    labels: NDArray[np.int32],
+    coefficients: NDArray[np.floating],
+    noise: float,
+    n_clusters: int,
 ) -> NDArray[np.float64]:
-    """Noise variance over the variance of each coefficient in each cluster."""
-    n_clusters, n_components = int(labels.max()) + 1, coefficients.shape[1]
-    precision = np.zeros((n_clusters, n_components, n_components))
-    for cluster in range(n_clusters):
+    """Noise variance over the variance of each coefficient in each cluster.
+
+    Both are floored relative to the spread of all coefficients, so that the unit of the
+    data does not matter; a cluster without spread gets the floor, its coefficients zero.
+    """
+    n_components = coefficients.shape[1]
+    precision = np.tile(np.eye(n_components), (n_clusters, 1, 1))
+    spread = float(coefficients.astype(np.float64).var(axis=0).max(initial=0.0))
+    least = max(LEAST_SPREAD * spread, np.finfo(np.float64).tiny)
+    for cluster in np.unique(labels):
         variance = coefficients[labels == cluster].astype(np.float64).var(axis=0)
-        floor = max(1e-6 * variance.max(initial=0.0), 1e-12)
-        np.fill_diagonal(
-            precision[cluster], max(noise, 1e-6) ** 2 / np.maximum(variance, floor)
-        )
+        floor = max(1e-6 * variance.max(initial=0.0), least)
+        ratio = max(noise**2, least) / np.maximum(variance, floor)
+        np.fill_diagonal(precision[cluster], ratio)
     return precision
 
 
@@ -144,7 +167,15 @@ def fill_unobserved(
     Returns
     -------
     ClusteredModel
+        The model itself if every texel has samples.
+
+    Raises
+    ------
+    InputError
+        If no texel has samples.
     """
+    if not len(observed):
+        raise InputError("observed: expected texels with samples, received none")
     empty = np.setdiff1d(np.arange(len(positions)), observed)
     if not len(empty):
         return model
@@ -152,4 +183,4 @@ def fill_unobserved(
     cluster, coefficients = model.cluster.copy(), model.coefficients.copy()
     cluster[empty] = cluster[observed[nearest]]
     coefficients[empty] = coefficients[observed[nearest]]
-    return ClusteredModel(cluster, coefficients, model.table, model.precision, model.residuals)
+    return replace(model, cluster=cluster, coefficients=coefficients)

@@ -34,6 +34,8 @@ Reader = Callable[[NDArray[np.intp]], RootedSamples]
 # Partial sums are formed for this many parts and added in order, so that the result does
 # not depend on the number of workers.
 N_PARTS = 8
+# Squares of this size stand for zero; far below what any unit of the data gives.
+LEAST_ENERGY = 1e-200
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class SampleFitOptions:
 
     rounds: int = 4
     iterations: int = 12
-    smoothness: float = 0.01
+    smoothness: float = 0.05
     max_bytes: int = 192 << 20
 
     def __post_init__(self) -> None:
@@ -173,6 +175,9 @@ def _solve_texel(
     coefficients[:] = found
     explained = 2 * np.dot(found, right) - np.dot(found, np.dot(full, found))
     squares[0] = max(squares[0] - explained, 0.0)
+    # Each coefficient that the samples determine takes one of them: without this the noise
+    # is underestimated, the prior is too weak, and texels with few samples overfit.
+    squares[1] = max(squares[1] - np.trace(np.linalg.solve(full + precision, full)), 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -359,16 +364,16 @@ class _BasisProblem:
         direction = rest.copy()
         energy = _dot(rest, rest)
         # Steps stop per cluster once rounding in float32 dominates.
-        floor = 1e-10 * np.maximum(energy, 1e-30)
+        floor = 1e-10 * np.maximum(energy, LEAST_ENERGY)
         for _ in range(iterations):
             image = normal(direction)
             step = np.where(
-                energy > floor, energy / np.maximum(_dot(direction, image), 1e-30), 0
+                energy > floor, energy / np.maximum(_dot(direction, image), LEAST_ENERGY), 0
             )
             table = table + step.astype(np.float32)[:, None, None, None] * direction
             rest = rest - step.astype(np.float32)[:, None, None, None] * image
             renewed = _dot(rest, rest)
-            ratio = (renewed / np.maximum(energy, 1e-30)).astype(np.float32)
+            ratio = (renewed / np.maximum(energy, LEAST_ENERGY)).astype(np.float32)
             direction = rest + ratio[:, None, None, None] * direction
             energy = renewed
         return table
@@ -417,7 +422,8 @@ def solve_coefficients(
     coefficients : (n, K) float32
         Zero for a texel without samples.
     squares : (n, 2) float64
-        Weighted squared residual and total weight (channels counted) of each texel.
+        Weighted squared residual of each texel, and its degrees of freedom: total weight
+        (channels counted) less the number of coefficients that the samples determine.
     """
     n_components = model.precision.shape[1]
     coefficients = np.zeros((len(cluster), n_components), np.float32)
@@ -465,7 +471,9 @@ def normalised(model: ClusteredModel, noise: float, chosen: NDArray[np.intp]) ->
             n_components, n_components
         )
         values, vectors = np.linalg.eigh(covariance)
-        scale = np.sqrt(np.maximum(values, 1e-6 * max(values[-1], 1e-12)))
+        if not values[-1] > 0:  # all alike
+            continue
+        scale = np.sqrt(np.maximum(values, 1e-6 * values[-1]))
         rows = model.cluster == c
         table[c, :, :, 0] += np.einsum("vlkc,k->vlc", table[c, :, :, 1:], centre)
         coefficients[rows] = (coefficients[rows] - centre) @ (vectors / scale)
