@@ -31,6 +31,8 @@ from reflfield.steps.standalone import metrics_text
 
 # Texels whose raw samples are averaged together for the mean texture.
 TEXELS_AT_ONCE = 1024
+# Memory of one such sample: RGB as half and as float, whether it is observed, twice.
+SAMPLE_BYTES = 24
 
 
 def publish(job: Job) -> None:
@@ -99,8 +101,10 @@ def average_samples(job: Job) -> NDArray[np.float32]:
     store = job.base_reader.store
     observed = store.observed
     averages = np.full((store.n_texels, 3), np.nan, np.float32)
-    for first in range(0, store.n_texels, TEXELS_AT_ONCE):
-        part = slice(first, min(first + TEXELS_AT_ONCE, store.n_texels))
+    each = SAMPLE_BYTES * observed.pairs.size
+    step = int(np.clip(job.resources.block_bytes // each, 1, TEXELS_AT_ONCE))
+    for first in range(0, store.n_texels, step):
+        part = slice(first, min(first + step, store.n_texels))
         seen = observed.views[part, :, None] & observed.lights[part, None, :] & observed.pairs
         averages[part] = mean_sample(store.read(part), seen)
     return averages

@@ -1,5 +1,7 @@
 """The command itself: help at once, results on stdout, progress on stderr, exit statuses."""
 
+import io
+import json
 import re
 import resource
 import shutil
@@ -7,6 +9,7 @@ import subprocess
 import sys
 
 import pytest
+from rich.console import Console
 
 import reflfield as package
 import reflfield.cli as cli
@@ -100,6 +103,18 @@ class TestProgress:
         assert re.search(r"relighting: 1 of 2, 0:\d\d left", outcome.err)
         assert "left" not in outcome.out
 
+    def test_bars_on_a_terminal_say_how_much_is_left(self, monkeypatch):
+        shown = io.StringIO()
+        terminal = Console(file=shown, force_terminal=True, width=120)
+        monkeypatch.setattr(cli, "errors", terminal)
+        with cli.showing_progress():
+            for done in (0, 1, 2, 0, 2):  # a second round takes the place of the first
+                report("views", done, 2)
+        # Without colours and cursor movements, the last picture of the bars.
+        plain = re.sub(r"\x1b\[[?0-9;]*[A-Za-z]", "", shown.getvalue())
+        last = [line for line in plain.splitlines() if "views" in line][-1]
+        assert re.search(r"views .* 2/2 +\d:\d\d:\d\d +\d:\d\d:\d\d", last)  # spent, left
+
 
 class TestRelight:
     def test_frames(self, reflfield, finished, tiny_capture, tmp_path):
@@ -153,3 +168,24 @@ def test_inspect_counts(reflfield, finished, tiny_capture, what):
     assert outcome.err == ""
     expected = {"capture": ("10", "60"), "field": ("cube_root", "factored"), "frames": ("2",)}
     assert all(re.search(rf"\b{word}\b", outcome.out) for word in expected[what])
+
+
+@pytest.mark.slow
+def test_demo(subprocess_run, tmp_path):
+    out = tmp_path / "demo"
+    outcome = subprocess_run("-m", "reflfield.cli", "demo", "-o", out)
+    assert outcome.status == 0, outcome.err
+    assert "arning" not in outcome.err
+    assert (out / "capture" / "capture.json").is_file()
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert len(metrics["frames"]) == 4
+    # Black scores below 15 dB here; how good it should be, benchmarks say.
+    assert metrics["mean"]["psnr_ldr"] > 20
+
+
+def test_demo_passes_on_what_the_simulator_says(reflfield, monkeypatch, tmp_path):
+    monkeypatch.setattr("reflfield.demo.SCENE", "no_such_scene")
+    outcome = reflfield("demo", "-o", tmp_path / "demo")
+    assert outcome.status == 2
+    assert "capture-sim" in outcome.err
+    assert "no_such_scene" in outcome.err

@@ -119,11 +119,11 @@ class TestWhatARunLeaves:
         assert 'src="http' not in page
         assert "Held-out photographs" in page
 
-    def test_results_on_stdout_and_nothing_on_stderr(self, finished):
+    def test_results_on_stdout_and_only_progress_on_stderr(self, finished):
         assert str(finished.folder / "field.rfld") in finished.outcome.out.splitlines()
         assert "PSNR" in finished.outcome.out
-        # No warning of a library, and no progress: every step took less than an interval.
-        assert "arning" not in finished.outcome.err
+        # Progress, where the machine is slow; no warning of a library.
+        assert [s for s in finished.outcome.err.splitlines() if not s.endswith(" left")] == []
 
 
 class TestSecondRun:
