@@ -166,6 +166,7 @@ def _solve_texel(
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
     precision: NDArray[np.float64],
+    n_values: int,
     coefficients: Floats,
     squares: NDArray[np.float64],
 ) -> None:
@@ -175,9 +176,11 @@ def _solve_texel(
     coefficients[:] = found
     explained = 2 * np.dot(found, right) - np.dot(found, np.dot(full, found))
     squares[0] = max(squares[0] - explained, 0.0)
-    # Each coefficient that the samples determine takes one of them: without this the noise
-    # is underestimated, the prior is too weak, and texels with few samples overfit.
-    squares[1] = max(squares[1] - np.trace(np.linalg.solve(full + precision, full)), 0.0)
+    # Each coefficient that the samples determine takes one of the values, of mean weight:
+    # without this the noise is underestimated, the prior is too weak, and texels with few
+    # samples overfit.
+    determined = np.trace(np.linalg.solve(full + precision, full))
+    squares[1] *= max(1.0 - determined / n_values, 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -201,8 +204,10 @@ def _solve_coefficients(
     for t in range(len(values)):
         normal = np.zeros((n_components, n_components))
         right = np.zeros(n_components)
+        n_values = 0
         for i in np.flatnonzero(view_weights[t]):
             weights = view_weights[t, i] * light_weights[t] * pairs[i]
+            n_values += 3 * int(np.count_nonzero(weights))
             _at_view(table[cluster[t]], view_nodes[t, i], view_taps[t, i], plane)
             _add_normal_equations(
                 values[t, i],
@@ -215,7 +220,9 @@ def _solve_coefficients(
                 squares[t],
             )
         if squares[t, 1] > 0 and n_components > 0:
-            _solve_texel(normal, right, precision[cluster[t]], coefficients[t], squares[t])
+            _solve_texel(
+                normal, right, precision[cluster[t]], n_values, coefficients[t], squares[t]
+            )
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
@@ -423,7 +430,7 @@ def solve_coefficients(
         Zero for a texel without samples.
     squares : (n, 2) float64
         Weighted squared residual of each texel, and its degrees of freedom: total weight
-        (channels counted) less the number of coefficients that the samples determine.
+        (channels counted), less the share of the values that coefficients are determined by.
     """
     n_components = model.precision.shape[1]
     coefficients = np.zeros((len(cluster), n_components), np.float32)

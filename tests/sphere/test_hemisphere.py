@@ -7,8 +7,11 @@ from hypothesis import strategies as st
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.hemisphere import (
+    HORIZON_SOFTNESS,
     HemisphereGrid,
     direction_from_square,
+    softened_cosine,
+    softened_cosine_of,
     square_from_direction,
 )
 
@@ -85,3 +88,32 @@ def test_bad_input_is_refused():
         HemisphereGrid(0)
     with pytest.raises(ShapeError, match="directions"):
         HemisphereGrid(3).taps(np.zeros((3, 2)))
+
+
+class TestSoftenedCosine:
+    @given(st.floats(-1, 1))
+    def test_is_the_cosine_or_a_foot_above_it(self, z):
+        value = float(softened_cosine(np.array(z)))
+        # Between max(z, 0) and a quarter of the softness above it, at the horizon itself.
+        assert max(z, 0) <= value <= max(z, 0) + HORIZON_SOFTNESS / 4 * (1 + 1e-15)
+        if z >= HORIZON_SOFTNESS:
+            assert value == z
+        if z <= -HORIZON_SOFTNESS:
+            assert value == 0
+
+    @given(st.floats(-1, 1))
+    def test_of_one_number_is_that_of_arrays(self, z):
+        # fused multiply-adds may round once less
+        assert np.isclose(softened_cosine_of(z), softened_cosine(np.array(z)), rtol=1e-14)
+
+    def test_value_and_slope_are_continuous(self):
+        z = np.linspace(-2 * HORIZON_SOFTNESS, 2 * HORIZON_SOFTNESS, 4001)
+        step = z[1] - z[0]
+        slope = np.diff(softened_cosine(z)) / step
+        assert slope.min() >= 0
+        assert slope.max() <= 1 + 1e-12
+        # The second derivative is 1 / 2w inside the band.
+        assert np.abs(np.diff(slope)).max() < 1.01 * step / (2 * HORIZON_SOFTNESS)
+
+    def test_keeps_the_dtype(self):
+        assert softened_cosine(np.zeros(2, np.float32)).dtype == np.float32
