@@ -61,7 +61,12 @@ class CompressionOptions:
             raise InputError(
                 f"fit: expected 'auto', 'samples' or 'grid', received {self.fit!r}"
             )
-        for name, least in (("n_clusters", 1), ("n_components", 0), ("rank", 1)):
+        for name, least in (
+            ("n_clusters", 1),
+            ("n_components", 0),
+            ("rank", 1),
+            ("training_texels", 1),
+        ):
             if getattr(self, name) < least:
                 raise InputError(
                     f"{name}: expected at least {least}, received {getattr(self, name)}"

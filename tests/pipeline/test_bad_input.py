@@ -243,6 +243,7 @@ class TestOptions:
             ("alignment.band_limit=0", ("alignment.band_limit", "at least 1", "0")),
             ("completion.method=magic", ("completion.method", "'map' or 'brand'", "'magic'")),
             ("compression.samples.rounds=0", ("compression.samples.rounds", "at least 1")),
+            ("compression.training_texels=0", ("compression.training_texels", "at least 1")),
             ("texture.largest=0", ("texture.largest", "0")),
             ("resampling.view_side=-3", ("resampling.view_side", "-3")),
             ("seed=-1", ("seed", "-1")),
