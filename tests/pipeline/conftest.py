@@ -104,14 +104,13 @@ def tiny_options(tmp_path_factory):
 def subprocess_run():
     """Function that runs a Python command line in a process of its own."""
 
-    def run(*words, **kwargs):
+    def run(*words, timeout=250):
         done = subprocess.run(
             [sys.executable, *map(str, words)],
             capture_output=True,
             text=True,
             check=False,
-            timeout=250,
-            **kwargs,
+            timeout=timeout,
         )
         return Outcome(done.returncode, done.stdout, done.stderr)
 

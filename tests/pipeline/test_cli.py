@@ -171,11 +171,12 @@ def test_inspect_counts(reflfield, finished, tiny_capture, what):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # 3 minutes on two idle cores; tests share theirs
 def test_demo(subprocess_run, tmp_path):
     out = tmp_path / "demo"
-    outcome = subprocess_run("-m", "reflfield.cli", "demo", "-o", out)
+    outcome = subprocess_run("-m", "reflfield.cli", "demo", "-o", out, timeout=1150)
     assert outcome.status == 0, outcome.err
-    assert "arning" not in outcome.err
+    assert [s for s in outcome.err.splitlines() if not s.endswith(" left")] == []
     assert (out / "capture" / "capture.json").is_file()
     metrics = json.loads((out / "metrics.json").read_text())
     assert len(metrics["frames"]) == 4
