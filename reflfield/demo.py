@@ -13,10 +13,12 @@ from reflfield.errors import ReflfieldError
 from reflfield.pipeline import run
 from reflfield.progress import report
 from reflfield.steps.job import Job
-from reflfield.steps.options import PipelineOptions
+from reflfield.steps.options import PipelineOptions, TextureOptions
 
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
+# A little coarser than usual: the demo has to end within three minutes, compilation included.
+OPTIONS = PipelineOptions(texture=TextureOptions(texels_per_pixel=1.2))
 
 
 def run_demo(out: Path, workers: int) -> Job:
@@ -43,7 +45,7 @@ def run_demo(out: Path, workers: int) -> Job:
     return run(
         open_capture(capture),
         out,
-        PipelineOptions(),
+        OPTIONS,
         hold_out=HELD_OUT,
         resources=Resources(workers=workers),
     )
