@@ -22,6 +22,8 @@ Floats = NDArray[np.float32]
 
 # Samples that a texel must have on average for each coefficient to be fitted to them.
 SAMPLES_PER_COEFFICIENT = 4
+# Samples of a texel, on average, above which the grids are dense enough.
+MOST_SAMPLES = 4096
 
 # Noise and coefficients have at least this share of the largest variance of a coefficient.
 LEAST_SPREAD = 1e-9
@@ -38,8 +40,8 @@ class CompressionOptions:
     fit : {"auto", "samples", "grid"}
         "grid": local PCA of the resampled texels, as in the paper. "samples": from there,
         mean, basis and coefficients are fitted to the samples themselves. "auto" fits to
-        the samples where a texel has fewer of them than the grids have nodes, but several
-        for each coefficient.
+        the samples where a texel has several of them for each coefficient, but not
+        thousands.
     rank : int
         Rank of the completion in the aligned frames.
     training_texels : int
@@ -72,15 +74,16 @@ class CompressionOptions:
                     f"{name}: expected at least {least}, received {getattr(self, name)}"
                 )
 
-    def fits_samples(self, n_samples: float, n_pairs: int) -> bool:
+    def fits_samples(self, n_samples: float) -> bool:
         """Whether to fit to the samples, of which a texel has `n_samples` on average.
 
-        On dense domes the grids lose nothing; with a few samples a texel, its
-        coefficients would follow their errors.
+        With a few samples a texel, its coefficients would follow their errors; on dense
+        domes the grids lose little and the samples of enough texels do not fit in memory.
         """
         enough = SAMPLES_PER_COEFFICIENT * self.n_components
-        sparse = enough <= n_samples < n_pairs
-        return self.fit == "samples" or (self.fit == "auto" and sparse)
+        return self.fit == "samples" or (
+            self.fit == "auto" and enough <= n_samples <= MOST_SAMPLES
+        )
 
 
 def cluster_completed(

@@ -65,6 +65,8 @@ class SampleFitOptions:
         for name in ("rounds", "iterations"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
+        if self.max_bytes < 1 << 20:
+            raise InputError(f"max_bytes: expected at least 1 MB, received {self.max_bytes}")
         if not self.smoothness >= 0:
             raise InputError(f"smoothness: expected >= 0, received {self.smoothness}")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
@@ -136,7 +136,22 @@ class FieldSurface:
             origins = origins + np.outer(ahead - self.scene.diagonal, camera.forward)
         return origins, directions
 
-    def footprints(self, hits: SurfaceHits, pixel: NDArray[np.int64]) -> Footprints:
+    @cached_property
+    def texel_width(self) -> float:
+        """Typical side of a texel on the surface, metres."""
+        return float(np.sqrt(self.mesh.area / self.field.n_texels))
+
+    def transitions(self, camera: Camera, hits: SurfaceHits) -> Array:
+        """Width (n,) over which texels blend at each hit; see `texel_taps`."""
+        distance = np.ones(len(hits.ray))
+        if camera.kind != ORTHOGRAPHIC:
+            distance = np.linalg.norm(hits.position - camera.centre, axis=1)
+        pixel_width = distance / max(camera.fl_x, camera.fl_y)
+        return np.clip(1.0 - pixel_width / self.texel_width, 0.0, 1.0)
+
+    def footprints(
+        self, hits: SurfaceHits, pixel: NDArray[np.int64], transition: ArrayLike = 1.0
+    ) -> Footprints:
         """Merge the texel taps of each pixel's hits.
 
         Parameters
@@ -145,6 +160,8 @@ class FieldSurface:
             Hits of a block of pixels.
         pixel : (n_hits,) int64
             Pixel of each hit, ascending.
+        transition : float or (n_hits,) float
+            Width over which texels blend; see `texel_taps`.
 
         Returns
         -------
@@ -156,7 +173,7 @@ class FieldSurface:
         A texel that is larger than a pixel is read by many samples from the
         same direction. Merged, it is evaluated once a pixel.
         """
-        texels, weights = texel_taps(self.field, hits.uv)
+        texels, weights = texel_taps(self.field, hits.uv, transition)
         weights *= hits.front[:, None]
         entry = np.full(texels.shape, -1, np.int64)
         entry_pixel = np.zeros(texels.size, np.int64)

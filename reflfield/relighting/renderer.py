@@ -232,7 +232,8 @@ class Renderer:
         hits = self.surface.first_hits(*rays)
         pixel = hits.ray // len(offsets)
         covered = np.bincount(pixel, minlength=len(row)) / len(offsets)
-        entries = self.surface.footprints(hits, pixel)
+        transition = self.surface.transitions(camera, hits)
+        entries = self.surface.footprints(hits, pixel, transition)
         total = np.zeros((len(row), 3))
         for source in sources:
             radiance = self._radiance(camera, source, hits, entries)

@@ -273,7 +273,7 @@ def fitted_model(job: Job, reader: TexelReader, scratch: Path) -> ClusteredModel
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)
     n_samples = job.observed.count() / len(seen)
-    if options.fits_samples(n_samples, reader.n_pairs):
+    if options.fits_samples(n_samples):
         model = fit_samples(
             reader.rooted,
             model,

@@ -166,8 +166,9 @@ def test_options_are_checked(changes, message):
         CompressionOptions(**changes)
 
 
-def test_dense_domes_are_fitted_on_the_grid():
-    assert CompressionOptions().fits_samples(900, 2401)
-    assert not CompressionOptions().fits_samples(2401, 2401)
-    assert CompressionOptions(fit="samples").fits_samples(9999, 10)
-    assert not CompressionOptions(fit="grid").fits_samples(100, 2401)
+def test_texels_with_very_few_or_very_many_samples_are_fitted_on_the_grid():
+    assert CompressionOptions().fits_samples(96)
+    assert not CompressionOptions().fits_samples(22_801 / 4)
+    assert not CompressionOptions().fits_samples(5)
+    assert CompressionOptions(fit="samples").fits_samples(9999)
+    assert not CompressionOptions(fit="grid").fits_samples(100)

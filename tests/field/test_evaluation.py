@@ -197,3 +197,10 @@ def test_taps_of_a_single_pixel():
     texels, weights = texel_taps(field, [[0.0, 0.0], [0.7, 1.0]])
     assert not texels.any()
     assert np.allclose(weights.sum(1), 1)
+
+
+@pytest.mark.parametrize(("transition", "expected"), [(1.0, 0.7), (0.5, 0.9), (0.0, 1.0)])
+def test_texels_blend_over_the_transition(transition, expected):
+    field = baked_field(square_surface(4), lambert(1.0))
+    texels, weights = texel_taps(field, [[(1.5 + 0.7) / 4, 1 - 1.5 / 4]], transition)
+    assert weights[0][texels[0] == 6].sum() == pytest.approx(expected, abs=1e-6)
