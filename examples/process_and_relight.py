@@ -16,6 +16,7 @@ from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.images import write_png
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
+from reflfield.config import read_toml, with_tables
 from reflfield.field.file import open_field
 from reflfield.pipeline import run
 from reflfield.relighting.exposure import encoded_picture
@@ -30,18 +31,23 @@ def novel_camera(positions: np.ndarray, up: np.ndarray, size: int) -> Camera:
     aside = np.cross(up, [0.62, 0.31, 0.72])
     position = centre + 6 * radius * (aside / np.linalg.norm(aside) + 0.3 * up)
     pose = looking_at(position, centre, up)
-    return Camera("novel", "opencv", size, size, 2.4 * size, 2.4 * size, size / 2, size / 2, pose)
+    focal, middle = 2.4 * size, 0.5 * size
+    return Camera("novel", "opencv", size, size, focal, focal, middle, middle, pose)
 
 
 def main() -> None:
+    """Parse, run, render."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--config", type=Path, help="options in TOML")
     parser.add_argument("--size", type=int, default=400, help="side of the picture, pixels")
     arguments = parser.parse_args()
 
     capture = open_capture(arguments.capture)
-    run(capture, arguments.out, PipelineOptions(), last="compression")
+    tables = read_toml(arguments.config) if arguments.config else {}
+    options = with_tables(PipelineOptions(), tables)
+    run(capture, arguments.out, options, last="compression")
 
     field = open_field(arguments.out / "field.rfld")
     camera = novel_camera(field.positions, capture.up, arguments.size)

@@ -62,11 +62,9 @@ class SampleFitOptions:
     max_bytes: int = 192 << 20
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "iterations"):
+        for name in ("rounds", "iterations", "max_bytes"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
-        if self.max_bytes < 1 << 20:
-            raise InputError(f"max_bytes: expected at least 1 MB, received {self.max_bytes}")
         if not self.smoothness >= 0:
             raise InputError(f"smoothness: expected >= 0, received {self.smoothness}")
 
