@@ -8,6 +8,7 @@ skipped when neither has changed, written whole or not at all, and resumed after
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +21,113 @@ from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
 
-STAGES = (
-    "silhouettes",
-    "hull",
-    "atlas",
-    "visibility",
-    "observations",
-    "completion",
-    "alignment",
-    "compression",
-    "comparison",
-    "report",
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: what computes it, and everything that its result depends on.
+
+    Parameters
+    ----------
+    name : str
+    compute : callable
+        Writes the results into a folder and returns counts.
+    after : str or None
+        Stage whose results it reads (and through it those before).
+    options : callable
+        What of the job's options matters.
+    reads : callable
+        Digests of what it reads besides.
+    """
+
+    name: str
+    compute: Callable[[Job, Path], Mapping[str, Any]]
+    after: str | None = None
+    options: Callable[[PipelineOptions], Any] = lambda options: None
+    reads: Callable[[Job], Mapping[str, str]] = lambda job: {}
+
+    def run(self, job: Job) -> None:
+        """Compute the stage, or take its earlier result."""
+        inputs = dict(self.reads(job))
+        if self.after is not None:
+            inputs[self.after] = job.stages.key(self.after)
+        job.stages.run(
+            self.name,
+            lambda folder: self.compute(job, folder),
+            options=self.options(job.options),
+            inputs=inputs,
+        )
+
+
+ORDER = (
+    # silhouettes, given or made from the photographs
+    Stage(
+        "silhouettes",
+        surface.write_silhouettes,
+        reads=lambda job: {"capture": job.training.digest(("cameras", "silhouettes"))},
+    ),
+    # silhouettes -> watertight mesh that encloses the object
+    Stage(
+        "hull",
+        surface.write_hull,
+        after="silhouettes",
+        options=lambda options: options.hull,
+        reads=lambda job: {"lights": job.training.digest(("lights",))},
+    ),
+    # mesh -> UV charts -> texel table
+    Stage(
+        "atlas",
+        surface.write_atlas,
+        after="hull",
+        options=lambda options: (options.atlas, options.texture),
+    ),
+    # which camera and which light each texel sees
+    Stage(
+        "visibility",
+        surface.write_visibility,
+        after="atlas",
+        options=lambda options: options.visibility,
+    ),
+    # photographs -> apparent BRDF samples per texel
+    Stage(
+        "observations",
+        reflectance.write_observations,
+        after="visibility",
+        reads=lambda job: {"photographs": job.training.digest(("photographs",))},
+    ),
+    # scattered directions -> common grid; missing samples filled
+    Stage(
+        "completion",
+        reflectance.write_completion,
+        after="observations",
+        options=lambda options: (options.completion, options.resampling, options.seed),
+    ),
+    # one local frame per texel
+    Stage(
+        "alignment",
+        reflectance.write_alignment,
+        after="completion",
+        options=lambda options: (options.alignment, options.seed),
+    ),
+    # raw samples again, in the aligned frames -> clustered local PCA -> field file
+    Stage(
+        "compression",
+        reflectance.write_compression,
+        after="alignment",
+        options=lambda options: (options.compression, options.seed),
+        reads=lambda job: {"name": job.capture.name},
+    ),
+    # held-out photographs against the field relit from their cameras
+    Stage(
+        "comparison",
+        evaluation.write_comparison,
+        after="compression",
+        options=lambda options: options.relighting,
+        reads=lambda job: {n: f.digest() for n, f in evaluation.frame_sets(job).items()},
+    ),
+    # everything that was found, in one page
+    Stage("report", outputs.write_report_page, after="comparison"),
 )
+STAGES = tuple(stage.name for stage in ORDER)
 
 
 def run(
@@ -80,86 +176,18 @@ def run(
             f"--from, --until: expected the first stage not after the last, received {first} "
             f"after {last}"
         )
-    options = options or PipelineOptions()
-    job = Job(capture, out, options, hold_out or HoldOut(), resources or Resources(), redo)
+    job = Job(
+        capture,
+        out,
+        options or PipelineOptions(),
+        hold_out or HoldOut(),
+        resources or Resources(),
+        redo,
+    )
     check_memory(job)
-    training, key = job.training, job.stages.key
-
-    def stage(
-        name: str,
-        compute: Callable[[Job, Path], Mapping[str, Any]],
-        depends: Any = None,
-        **inputs: str,
-    ) -> None:
-        job.stages.run(name, lambda to: compute(job, to), options=depends, inputs=inputs)
-
-    stages: dict[str, Callable[[], None]] = {
-        # silhouettes, given or made from the photographs
-        "silhouettes": lambda: stage(
-            "silhouettes",
-            surface.write_silhouettes,
-            capture=training.digest(("cameras", "silhouettes")),
-        ),
-        # silhouettes -> watertight mesh that encloses the object
-        "hull": lambda: stage(
-            "hull",
-            surface.write_hull,
-            options.hull,
-            silhouettes=key("silhouettes"),
-            lights=training.digest(("lights",)),
-        ),
-        # mesh -> UV charts -> texel table
-        "atlas": lambda: stage(
-            "atlas", surface.write_atlas, (options.atlas, options.texture), hull=key("hull")
-        ),
-        # which camera and which light each texel sees
-        "visibility": lambda: stage(
-            "visibility", surface.write_visibility, options.visibility, atlas=key("atlas")
-        ),
-        # photographs -> apparent BRDF samples per texel
-        "observations": lambda: stage(
-            "observations",
-            reflectance.write_observations,
-            visibility=key("visibility"),
-            photographs=training.digest(("photographs",)),
-        ),
-        # scattered directions -> common grid; missing samples filled
-        "completion": lambda: stage(
-            "completion",
-            reflectance.write_completion,
-            (options.completion, options.resampling, options.seed),
-            observations=key("observations"),
-        ),
-        # one local frame per texel
-        "alignment": lambda: stage(
-            "alignment",
-            reflectance.write_alignment,
-            (options.alignment, options.seed),
-            completion=key("completion"),
-        ),
-        # raw samples again, in the aligned frames -> clustered local PCA -> field file
-        "compression": lambda: stage(
-            "compression",
-            reflectance.write_compression,
-            (options.compression, options.seed, capture.name),
-            alignment=key("alignment"),
-        ),
-        # held-out photographs against the field relit from their cameras
-        "comparison": lambda: stage(
-            "comparison",
-            evaluation.write_comparison,
-            options.relighting,
-            compression=key("compression"),
-            **{name: f.digest() for name, f in evaluation.frame_sets(job).items()},
-        ),
-        # everything that was found, in one page
-        "report": lambda: stage(
-            "report", outputs.write_report_page, comparison=key("comparison")
-        ),
-    }
     with only_run(job.stages.root):
-        for name in wanted:
-            stages[name]()
+        for stage in ORDER[: len(wanted)]:
+            stage.run(job)
         outputs.publish(job)
     return job
 
