@@ -64,10 +64,9 @@ RAY_BYTES = 4096
 def within_memory(options: RenderOptions, resources: Resources) -> RenderOptions:
     """Blocks of pixels that all threads together can work on; the pictures stay the same."""
     each = RAY_BYTES * options.samples_per_pixel
-    fits = max(4 * resources.block_bytes // (resources.workers * each), 64)
-    return replace(
-        options, workers=resources.workers, block_pixels=min(options.block_pixels, fits)
-    )
+    workers = options.workers or resources.workers
+    fits = max(4 * resources.block_bytes // (workers * each), 64)
+    return replace(options, workers=workers, block_pixels=min(options.block_pixels, fits))
 
 
 def frame_sets(job: Job) -> dict[str, Capture]:
