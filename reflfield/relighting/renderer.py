@@ -197,7 +197,13 @@ class Renderer:
         given = [lights] if isinstance(lights, Light | EnvironmentMap) else list(lights)
         if self.field.light_model == "unknown":
             return [Light("of the field", UNKNOWN)] if given else []
-        return [self._source(light) for light in given]
+        # A frame may name several lights at once: they are one light of the capture.
+        singles = [
+            single
+            for light in given
+            for single in (light.sources if isinstance(light, Light) else (light,))
+        ]
+        return [self._source(single) for single in singles]
 
     def _source(self, light: Light | EnvironmentMap) -> Light | EnvironmentLighting:
         if isinstance(light, Light) and light.kind == UNKNOWN:

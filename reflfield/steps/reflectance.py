@@ -30,7 +30,7 @@ from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain, versions
 from reflfield.steps.columns import BlockedColumns, half_columns
-from reflfield.steps.job import Job, load_arrays
+from reflfield.steps.job import Job
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -329,6 +329,3 @@ def field_metadata(job: Job) -> dict[str, Any]:
         "options": options,
         "versions": versions(),
     }
-
-
-__all__ = ["load_arrays"]

@@ -193,6 +193,9 @@ def test_linear_in_the_lights(rng, rounding):
     both = renderer.render(camera, [first, second]).image
     alone = [renderer.render(camera, light).image for light in (first, second)]
     assert np.abs(both - sum(alone)).max() < rounding(np.float32, scale=both.max())
+    # A frame with several lights names them as one group.
+    group = Light("both", "group", members=(first, second))
+    assert np.array_equal(renderer.render(camera, group).image, both)
     double = renderer.render(camera, replace(first, intensity=2 * first.intensity)).image
     assert np.abs(double - 2 * alone[0]).max() < rounding(np.float32, scale=double.max())
     assert not renderer.render(camera, []).image.any()
