@@ -2,10 +2,12 @@
 
 from reflfield.alignment.aligning import Alignment, SampleSource, align
 from reflfield.alignment.normal_maps import local_map, world_map
+from reflfield.alignment.refinement import RefinementOptions
 from reflfield.alignment.searching import SearchResult, search
 
 __all__ = [
     "Alignment",
+    "RefinementOptions",
     "SampleSource",
     "SearchResult",
     "align",

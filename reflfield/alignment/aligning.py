@@ -112,7 +112,7 @@ def align(
     iterations: int = 4,
     n_clusters: int = 1,
     *,
-    refine: bool = True,
+    refine: bool | RefinementOptions = True,
     seed: int = 0,
     max_tilt: float | None = None,
     n_threads: int = 1,
@@ -133,8 +133,9 @@ def align(
         Rounds of expectation maximisation at most; at least 1.
     n_clusters : int
         Materials to tell apart.
-    refine : bool
-        True: refine the frames on the samples themselves after the harmonic search.
+    refine : bool or RefinementOptions
+        True: refine the frames on the samples themselves after the harmonic search, with the
+        default options; or the options to refine with.
     seed : int
         Of the seeding and of the choice of training texels.
     max_tilt : float, optional
@@ -191,7 +192,8 @@ def align(
     gauged = fix_gauge(fit.targets, fit.found.rotations, fit.found.cluster, weights)
     found = _search(task, training, gauged, gauged.rotations)
     fit = replace(fit, targets=gauged.targets, found=found)
-    sharp = _sharpen(task, rows, training, fit, RefinementOptions()) if refine else None
+    refinement = RefinementOptions() if refine is True else refine
+    sharp = _sharpen(task, rows, training, fit, refinement) if refinement else None
     # Find the frames of all texels, block by block.
     return _finish(task, rows, fit, gauged, sharp)
 

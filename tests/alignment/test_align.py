@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment import align
+from reflfield.alignment import RefinementOptions, align
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.rotations import frames_from_normals
 
@@ -42,6 +42,16 @@ def test_normals_come_back_and_refinement_makes_them_sharp(relief, aligned, scen
     # The mean tangent is a gauge: the base frames', not the truth's.
     assert tangent.mean() < 5.0
     assert aligned.symmetries == ("half",)
+
+
+def test_options_of_the_refinement_are_used_as_given(relief, scene):
+    frames, directions, samples = relief
+    one = RefinementOptions(rounds=1, last_steps=1)
+    short = align(samples, directions, directions, refine=one)
+    long = align(samples, directions, directions, refine=RefinementOptions())
+    errors = [scene.frame_errors(r.local_from_base, frames)[0].mean() for r in (short, long)]
+    # Each round more than halves the error at first.
+    assert errors[0] > 1.5 * errors[1]
 
 
 def test_history_never_falls(aligned):
