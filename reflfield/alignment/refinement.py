@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from reflfield.alignment.correlation import copy_matrix, turned
 from reflfield.alignment.correlation import scale as shrink
 from reflfield.alignment.searching import map_blocks
+from reflfield.checks import check_shape
 from reflfield.sphere.hemisphere import first_tap, square_from_xyz
 
 # Half of the step by which the taps' positions are differenced, radians: well below the
@@ -75,22 +76,46 @@ class RefinementOptions:
 
 @dataclass(frozen=True, eq=False)
 class SampleSet:
-    """Samples of some texels, all from the same directions in their base frames.
+    """Samples of some texels with their directions in the base frames.
 
     Parameters
     ----------
     samples : (n, n_views, n_lights) float32
         Not finite where unobserved.
-    views, lights : (k, 3) float64
+    views : (n_views, 3) or (n, n_views, 3) float64
+        Unit vectors: the same for all texels, or each texel its own.
+    lights : (n_lights, 3) or (n, n_lights, 3) float64
+
+    Raises
+    ------
+    ShapeError
+        If directions do not belong to the samples.
     """
 
     samples: NDArray[np.float32]
     views: NDArray[np.float64]
     lights: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        n, *counts = self.samples.shape
+        for name, directions, count in zip(
+            ("views", "lights"), (self.views, self.lights), counts, strict=True
+        ):
+            own = (n,) if directions.ndim == 3 else ()
+            check_shape(name, directions, (*own, count, 3))
+
     def part(self, rows: slice | NDArray[np.int64]) -> SampleSet:
         """Samples of some of the texels."""
-        return SampleSet(self.samples[rows], self.views, self.lights)
+        views, lights = (
+            directions[rows] if directions.ndim == 3 else directions
+            for directions in (self.views, self.lights)
+        )
+        return SampleSet(self.samples[rows], views, lights)
+
+    def directions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Views and lights with a leading axis: one entry for all texels, or one for each."""
+        views, lights = (d if d.ndim == 3 else d[None] for d in (self.views, self.lights))
+        return views, lights
 
     def brightness(self) -> NDArray[np.float64]:
         """(n,) root mean square of the observed samples; 0 where there is none."""
@@ -233,17 +258,18 @@ def spread(
 
     They are interleaved along the light nodes: (view nodes, 2 * light nodes).
     """
-    v_nodes, v_places = np.zeros(len(views), np.int64), np.zeros((len(views), 8))
-    l_nodes, l_places = np.zeros(len(lights), np.int64), np.zeros((len(lights), 8))
+    n_views, n_lights = samples.shape[1:]
+    v_nodes, v_places = np.zeros(n_views, np.int64), np.zeros((n_views, 8))
+    l_nodes, l_places = np.zeros(n_lights, np.int64), np.zeros((n_lights, 8))
     lines = np.zeros((3, target.shape[1]), np.float32)
     out = np.zeros(2 * target.shape[1])
     right, up = (1, sides[0]) if sides[0] > 1 else (0, 0)
     for i in range(samples.shape[0]):
         if brightness[i] <= 0.0:
             continue
-        _place(views, frames[i], sides[0], v_nodes, v_places)
-        _place(lights, frames[i], sides[1], l_nodes, l_places)
-        for v in range(len(views)):
+        _place(views[i % len(views)], frames[i], sides[0], v_nodes, v_places)
+        _place(lights[i % len(lights)], frames[i], sides[1], l_nodes, l_places)
+        for v in range(n_views):
             node = v_nodes[v]
             if node < 0:
                 continue
@@ -375,8 +401,9 @@ def improve(
     n_steps: int,
 ) -> None:
     """Gauss-Newton steps of frames and brightness of some texels, in place."""
-    v_nodes, v_places = np.zeros(len(views), np.int64), np.zeros((len(views), 8))
-    l_nodes, l_places = np.zeros(len(lights), np.int64), np.zeros((len(lights), 8))
+    n_views, n_lights = samples.shape[1:]
+    v_nodes, v_places = np.zeros(n_views, np.int64), np.zeros((n_views, 8))
+    l_nodes, l_places = np.zeros(n_lights, np.int64), np.zeros((n_lights, 8))
     lines = np.zeros((3, target.shape[1]), np.float32)
     normal, step, turn = np.zeros((5, 5)), np.zeros(4), np.zeros((3, 3))
     frame, scale_factor = np.zeros((3, 3)), 1.0
@@ -388,9 +415,9 @@ def improve(
         for n in range(n_steps + 1):
             normal[:] = 0.0
             scale = brightness[i] * scale_factor if n > 0 else brightness[i]
-            _place(views, frame, sides[0], v_nodes, v_places)
-            _place(lights, frame, sides[1], l_nodes, l_places)
-            for v in range(len(views)):
+            _place(views[i % len(views)], frame, sides[0], v_nodes, v_places)
+            _place(lights[i % len(lights)], frame, sides[1], l_nodes, l_places)
+            for v in range(n_views):
                 if v_nodes[v] >= 0:
                     place = v_places[v]
                     _blend(target, v_nodes[v], sides[0], place[0], place[1], lines)
@@ -460,8 +487,7 @@ def fit_nodes(
             part = data.part(own)
             spread(
                 part.samples,
-                part.views,
-                part.lights,
+                *part.directions(),
                 frames[own],
                 brightness[own],
                 values[k],
@@ -499,8 +525,7 @@ def improve_frames(
             frame, bright = frames[own], brightness[own]
             improve(
                 part.samples,
-                part.views,
-                part.lights,
+                *part.directions(),
                 frame,
                 bright,
                 targets.values[k],
@@ -540,7 +565,7 @@ def refine_targets(
     frames : (n, 3, 3) float64
     """
     frames, brightness = frames.copy(), data.brightness()
-    sides = [1 if len(d) == 1 else options.side for d in (data.views, data.lights)]
+    sides = [1 if count == 1 else options.side for count in data.samples.shape[1:]]
     empty = np.zeros((n_clusters, sides[0] ** 2, sides[1] ** 2), np.float32)
     targets = NodeTargets(empty, sides[0], sides[1])
     for _ in range(options.rounds):
