@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.dome import look_at
+from capture_sim.model import Scene
 from capture_sim.rays import world_from_camera
-from capture_sim.scene import Scene
 
 Table = Mapping[str, Any]
 Array = NDArray[np.float64]

@@ -11,29 +11,17 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
 
-from capture_sim.effects import (
-    Cost,
-    Workload,
-    antialiasing,
-    interreflection,
-    near_lights,
-    quantisation,
-    sensor_noise,
-    shadows,
-)
-from capture_sim.effects.near_lights import illuminate
+from capture_sim.effects import Cost, Effect, Workload, simulated
+from capture_sim.effects.registry import EFFECTS, decided
 from capture_sim.files import write_exr
+from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
-from capture_sim.render import ViewSamples, sample_view, shade
-from capture_sim.scene import Scene
+from capture_sim.render import ViewSamples, arriving_light, sample_view, shade
 from capture_sim.truth import write_view_truth
-
-EFFECTS = (antialiasing, near_lights, shadows, sensor_noise, quantisation, interreflection)
 
 # Enough to average over near and far sides of the object, few enough to take no time.
 TRIAL_VIEWS = 3
@@ -52,13 +40,17 @@ class PlannedEffect:
     name : str
     simulated : bool
     reason : str
+    bound : float
+        Largest change of any photograph if it is left out, as a part of the
+        photograph's 99th percentile.
     cost : Cost
-        What it adds to the rendering.
+        What it adds to the rendering; nothing if it is not simulated.
     """
 
     name: str
     simulated: bool
     reason: str
+    bound: float
     cost: Cost
 
 
@@ -103,13 +95,18 @@ class Plan:
             "effects",
         ]
         return counts + [
-            f"  {'yes' if effect.simulated else 'no ':3}  {effect.name:16} {effect.reason}"
+            f"  {'on' if effect.simulated else 'off':3}  {effect.name:18} "
+            f"{_bound_text(effect.bound):>9}  {effect.reason}"
             for effect in self.effects
         ]
 
 
 def _seconds_text(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+def _bound_text(bound: float) -> str:
+    return f"<= {100.0 * bound:.3g} %" if np.isfinite(bound) else "unbounded"
 
 
 def plan(scene: Scene) -> Plan:
@@ -124,6 +121,7 @@ def plan(scene: Scene) -> Plan:
     Plan
         Its times depend on how busy the machine is.
     """
+    scene = decided(scene)
     tracer = RayTracer(scene.mesh)
     trial = _run_trial(scene, tracer)
     n_views, n_lights = len(scene.cameras), len(scene.lights)
@@ -141,15 +139,16 @@ def plan(scene: Scene) -> Plan:
     return Plan(
         scene=scene.name,
         work=work,
-        effects=tuple(_decided(effect, scene, work) for effect in EFFECTS),
+        effects=tuple(_planned(effect, scene, work) for effect in EFFECTS),
         seconds=n_views * trial.view_seconds + frames * trial.photograph_seconds,
         bytes=int(n_views * trial.view_bytes + frames * trial.photograph_bytes) + fixed_bytes,
     )
 
 
-def _decided(effect: ModuleType, scene: Scene, work: Workload) -> PlannedEffect:
-    simulated, reason = effect.needed(scene)
-    return PlannedEffect(effect.NAME, simulated, reason, effect.cost(scene, work))
+def _planned(effect: Effect, scene: Scene, work: Workload) -> PlannedEffect:
+    decision, is_on = effect.needed(scene), simulated(scene, effect)
+    cost = effect.cost(scene, work) if is_on else Cost()
+    return PlannedEffect(effect.NAME, is_on, decision.reason, decision.bound, cost)
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ def _one_view(
             truth_bytes = (Path(folder) / f"truth/views/{identity['id']}.npz").stat().st_size
     return (
         len(view.points),
-        _lit_fraction(view, lights),
+        _lit_fraction(scene, view, lights),
         view_seconds + truth_seconds,
         truth_bytes,
         shade_seconds / len(lights) + write_seconds,
@@ -198,12 +197,12 @@ def _one_view(
     )
 
 
-def _lit_fraction(view: ViewSamples, lights: tuple[Table, ...]) -> float:
+def _lit_fraction(scene: Scene, view: ViewSamples, lights: tuple[Table, ...]) -> float:
     """Part of the pairs of point and light with the light above the horizon."""
     points = view.points[:: max(1, len(view.points) // 4096)]
     if len(points) == 0:
         return 0.0
-    directions = illuminate(lights, points.position).directions
+    directions = arriving_light(scene, lights, points.position).directions
     cosine = np.einsum("nlj,nj->nl", directions, points.shading_from_world[:, 2])
     return float((cosine > 0.0).mean())
 

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from capture_sim.effects import antialiasing, near_lights, shadows
+from capture_sim.effects import antialiasing, near_lights, shadows, simulated
 from capture_sim.materials import Material
+from capture_sim.model import Scene
 from capture_sim.rays import RayTracer, camera_rays, towards_camera
-from capture_sim.scene import Scene
 from capture_sim.surface import SurfacePoints, surface_points
 
 Table = Mapping[str, Any]
@@ -75,11 +75,12 @@ def sample_view(scene: Scene, tracer: RayTracer, camera: Table) -> ViewSamples:
     -------
     ViewSamples
     """
-    coverage, edge = _coverage(scene, tracer, camera)
+    per_side, per_side_at_edges = rays_per_side(scene)
+    coverage, edge = _coverage(scene, tracer, camera, per_side_at_edges)
     inside = np.flatnonzero((coverage > 0.0) & ~edge)
     hits = [
-        _sub_pixel_hits(tracer, camera, inside, scene.image.samples_per_side),
-        _sub_pixel_hits(tracer, camera, np.flatnonzero(edge), _edge_samples(scene)),
+        _sub_pixel_hits(tracer, camera, inside, per_side),
+        _sub_pixel_hits(tracer, camera, np.flatnonzero(edge), per_side_at_edges),
     ]
     pixel, weight, face, barycentric = (
         np.concatenate(part) for part in zip(*hits, strict=True)
@@ -96,16 +97,39 @@ def sample_view(scene: Scene, tracer: RayTracer, camera: Table) -> ViewSamples:
     )
 
 
-def _edge_samples(scene: Scene) -> int:
-    return max(scene.image.edge_samples_per_side, scene.image.samples_per_side)
+def rays_per_side(scene: Scene) -> tuple[int, int]:
+    """Rays along each side of a pixel inside the object, and where an outline crosses it."""
+    return antialiasing.apply(scene) if simulated(scene, antialiasing) else (1, 1)
+
+
+def arriving_light(
+    scene: Scene, lights: tuple[Table, ...], points: Array
+) -> near_lights.Illumination:
+    """Direction and facing irradiance of every light at every point, without shadows.
+
+    Parameters
+    ----------
+    scene : Scene
+        Decides whether lights are at a finite distance.
+    lights : tuple of dict
+        Lights of the native capture format.
+    points : (n, 3) float64
+        World, metres.
+
+    Returns
+    -------
+    Illumination
+    """
+    if simulated(scene, near_lights):
+        return near_lights.apply(lights, points)
+    return near_lights.far_field(lights, scene.mesh.centre, points)
 
 
 def _coverage(
-    scene: Scene, tracer: RayTracer, camera: Table
+    scene: Scene, tracer: RayTracer, camera: Table, per_side: int
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Covered part of each pixel and whether an outline crosses it, both (h * w,)."""
     n_pixels = int(camera["h"]) * int(camera["w"])
-    per_side = _edge_samples(scene)
     step = EDGE_STEP * scene.mesh.radius
     coverage, edge = np.zeros(n_pixels), np.zeros(n_pixels, dtype=bool)
     rows = max(1, RAYS_PER_BLOCK // per_side**2)
@@ -244,10 +268,10 @@ def lit_pairs(
     lit = cosine > 0.0
     if seen is not None:
         lit &= seen[:, None]
-    if shadows.needed(scene)[0]:
+    if simulated(scene, shadows):
         point, light = np.nonzero(lit)
         targets = arriving.targets[point, light]
-        lit[point, light] = shadows.unoccluded(tracer, points, point, targets)
+        lit[point, light] = shadows.apply(tracer, points, point, targets)
     return lit, cosine
 
 
@@ -278,7 +302,7 @@ def shade(
     for first in range(0, len(view.points), step):
         block = slice(first, first + step)
         points = view.points[block]
-        arriving = near_lights.illuminate(lights, points.position)
+        arriving = arriving_light(scene, lights, points.position)
         views = towards_camera(view.camera, points.position)
         reflectance = apparent_reflectance(scene, tracer, points, views, arriving)
         radiance = (reflectance * arriving.irradiance).reshape(len(points), -1)

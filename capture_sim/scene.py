@@ -21,9 +21,10 @@ A scene file holds the tables below; only `object`, `material`, `cameras` and
     samples_per_side = 2             # rays along each side of a pixel, inside
     edge_samples_per_side = 4        # the same where an outline crosses it
 
-    [effects]
-    shadows = "auto"                 # "on", "off"
-    exposure_seconds = [0.1, 1.0]    # bracketed 8-bit PNGs; linear EXR if left out
+    [effects]                        # or: effects = "auto"
+    simulate = "auto"                # "all", "none", or a list of names
+    tolerance = 1e-3                 # changes below this part of a frame's 99th percentile
+    shadows = "off"                  # any effect: "on", "off", "auto"; or its parameters:
     [effects.sensor_noise]
     electrons_per_radiance = 1e5
     read_noise = 2.0                 # electrons
@@ -39,141 +40,31 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from capture_sim.dome import make_cameras, make_lights
+from capture_sim.effects.registry import read_effects
 from capture_sim.errors import SceneError, scene_error
-from capture_sim.materials import Material, make_material
-from capture_sim.objects import SurfaceMesh, make_object
-from capture_sim.tables import TableReader, check_number
+from capture_sim.materials import make_material
+from capture_sim.model import EffectOptions, ImageOptions, Scene, TruthOptions
+from capture_sim.objects import make_object
+from capture_sim.tables import TableReader
 
 Table = Mapping[str, Any]
 
+__all__ = [
+    "EffectOptions",
+    "ImageOptions",
+    "Scene",
+    "TruthOptions",
+    "find_scene",
+    "load_scene",
+    "parse_scene",
+    "shipped_scenes",
+]
+
 SHIPPED = Path(__file__).parent / "scenes"
-
-
-@dataclass(frozen=True)
-class ImageOptions:
-    """Rays per pixel.
-
-    Attributes
-    ----------
-    samples_per_side : int
-        Rays along each side of a pixel inside the object.
-    edge_samples_per_side : int
-        The same where an outline crosses the pixel; also the precision of
-        the silhouettes, 1 / edge_samples_per_side**2.
-    """
-
-    samples_per_side: int = 2
-    edge_samples_per_side: int = 4
-
-
-@dataclass(frozen=True)
-class NoiseOptions:
-    """Sensor noise.
-
-    Attributes
-    ----------
-    electrons_per_radiance : float
-        Expected electrons for radiance 1.
-    read_noise : float
-        Standard deviation in electrons.
-    """
-
-    electrons_per_radiance: float
-    read_noise: float = 0.0
-
-
-@dataclass(frozen=True)
-class EffectOptions:
-    """Which effects may be simulated; each decides for itself if it is called for.
-
-    Attributes
-    ----------
-    shadows : str
-        ``"auto"``, ``"on"`` or ``"off"``.
-    sensor_noise : NoiseOptions or None
-        None for a perfect sensor.
-    exposure_seconds : tuple of float
-        Exposure times of bracketed 8-bit photographs; none for linear ones.
-    """
-
-    shadows: str = "auto"
-    sensor_noise: NoiseOptions | None = None
-    exposure_seconds: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
-class TruthOptions:
-    """Which truth is written beside the photographs.
-
-    Attributes
-    ----------
-    per_view : bool
-        True for depth, position, frames, label and light visibility per view.
-    points : int
-        Surface points whose full apparent BRDF is written; 0 for none.
-    """
-
-    per_view: bool = True
-    points: int = 400
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Everything that determines a simulated capture.
-
-    Attributes
-    ----------
-    name, description : str
-    mesh : SurfaceMesh
-        The true surface.
-    material : Material
-    cameras, lights : tuple of dict
-        In the native capture format.
-    base_geometry : str
-        ``"hull"`` or ``"plane"``, a hint for those who process the capture.
-    image : ImageOptions
-    effects : EffectOptions
-    heldout_frames : int
-        Photographs of unseen views under unseen lights.
-    truth : TruthOptions
-    seed : int
-        Of noise, held-out frames and truth points.
-    """
-
-    name: str
-    mesh: SurfaceMesh
-    material: Material
-    cameras: tuple[Table, ...]
-    lights: tuple[Table, ...]
-    description: str = ""
-    base_geometry: str = "hull"
-    image: ImageOptions = field(default_factory=ImageOptions)
-    effects: EffectOptions = field(default_factory=EffectOptions)
-    heldout_frames: int = 0
-    truth: TruthOptions = field(default_factory=TruthOptions)
-    seed: int = 1
-
-    def __post_init__(self) -> None:
-        for what, items in (("cameras", self.cameras), ("lights", self.lights)):
-            ids = [item["id"] for item in items]
-            if not ids or len(set(ids)) != len(ids):
-                raise scene_error(what, "one or more entries with unique ids", ids)
-        if self.heldout_frames and any(c["model"] != "opencv" for c in self.cameras):
-            raise scene_error(
-                "heldout.frames",
-                "0 for cameras other than opencv, which transforms.json cannot describe",
-                self.heldout_frames,
-                "remove [heldout]",
-            )
-        if self.heldout_frames and any(light["type"] == "spot" for light in self.lights):
-            raise scene_error(
-                "heldout.frames", "0 for spot lights", self.heldout_frames, "remove [heldout]"
-            )
 
 
 def shipped_scenes() -> dict[str, str]:
@@ -287,7 +178,7 @@ def parse_scene(table: Table, *, default_name: str = "scene", folder: Path = Pat
         cameras=tuple(make_cameras(_required_table(reader, "cameras"))),
         lights=tuple(make_lights(_required_table(reader, "lights"))),
         image=_image_options(reader.take("image", {})),
-        effects=_effect_options(reader.take("effects", {})),
+        effects=read_effects(reader.take("effects", {})),
         heldout_frames=_heldout_frames(reader.take("heldout", {})),
         truth=_truth_options(reader.take("truth", {})),
     )
@@ -321,38 +212,6 @@ def _image_options(table: Table) -> ImageOptions:
     options = ImageOptions(
         samples_per_side=reader.count("samples_per_side", 2, high=64),
         edge_samples_per_side=reader.count("edge_samples_per_side", 4, high=64),
-    )
-    reader.finish()
-    return options
-
-
-def _effect_options(table: Table) -> EffectOptions:
-    reader = TableReader("effects", table)
-    shadows = reader.choice("shadows", "auto", ("auto", "on", "off"))
-    noise = reader.take("sensor_noise")
-    seconds = reader.take("exposure_seconds")
-    reader.finish()
-    return EffectOptions(
-        shadows=shadows,
-        sensor_noise=None if noise is None else _noise_options(noise),
-        exposure_seconds=() if seconds is None else _exposure_seconds(seconds),
-    )
-
-
-def _exposure_seconds(value: Any) -> tuple[float, ...]:
-    what = "effects.exposure_seconds"
-    if not isinstance(value, list) or not 1 <= len(value) <= 64:
-        raise scene_error(what, "a list of 1 to 64 exposure times", value)
-    return tuple(check_number(what, time, low=1e-9, high=1e9) for time in value)
-
-
-def _noise_options(table: Table) -> NoiseOptions:
-    reader = TableReader("effects.sensor_noise", table)
-    reader.require("electrons_per_radiance")
-    reader = TableReader("effects.sensor_noise", table)
-    options = NoiseOptions(
-        electrons_per_radiance=reader.number("electrons_per_radiance", 0.0, low=1e-12),
-        read_noise=reader.number("read_noise", 0.0, low=0.0),
     )
     reader.finish()
     return options

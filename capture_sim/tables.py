@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import Field, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from capture_sim.errors import scene_error
 
 Table = Mapping[str, Any]
+Options = TypeVar("Options")
 
 
 class TableReader:
@@ -149,3 +151,71 @@ def check_vector(what: str, value: Any, length: int) -> NDArray[np.float64]:
 
 def _plain(entry: Any) -> Any:
     return entry.item() if isinstance(entry, np.generic) else entry
+
+
+def bounded(default: Any, *, low: float = -math.inf, high: float = math.inf) -> Any:
+    """Field of an options dataclass: a number, whole number or tuple of numbers in a range.
+
+    Parameters
+    ----------
+    default : float, int or tuple of float
+        Also says which of these it is.
+    low, high : float
+        Smallest and largest value.
+    """
+    return field(default=default, metadata={"low": low, "high": high})
+
+
+def one_of(default: str, *others: str) -> Any:
+    """Field of an options dataclass: one of some words, the first by default."""
+    return field(default=default, metadata={"choices": (default, *others)})
+
+
+def read_options(kind: type[Options], reader: TableReader) -> Options:
+    """Read a table into a dataclass whose fields have defaults.
+
+    Parameters
+    ----------
+    kind : type
+        Frozen dataclass; ranges of its fields come from `bounded` and `one_of`.
+    reader : TableReader
+
+    Returns
+    -------
+    dataclass
+
+    Raises
+    ------
+    SceneError
+        For unknown keys and values out of range.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True)
+    ... class Lens:
+    ...     f_number: float = bounded(8.0, low=0.5)
+    >>> read_options(Lens, TableReader("lens", {"f_number": 2.8}))
+    Lens(f_number=2.8)
+    """
+    values = {one.name: _option(reader, one) for one in fields(kind)}  # type: ignore[arg-type]
+    reader.finish()
+    return kind(**values)
+
+
+def _option(reader: TableReader, one: Field[Any]) -> Any:
+    default: Any = one.default
+    limits = one.metadata
+    if "choices" in limits:
+        return reader.choice(one.name, default, limits["choices"])
+    if isinstance(default, bool):
+        return reader.flag(one.name, default)
+    low, high = limits["low"], limits["high"]
+    if isinstance(default, int):
+        return reader.count(one.name, default, low=int(low), high=int(high))
+    if isinstance(default, tuple):
+        entries = reader.numbers(one.name, default)
+        return tuple(
+            check_number(reader.name(one.name), v, low=low, high=high) for v in entries.tolist()
+        )
+    return reader.number(one.name, default, low=low, high=high)

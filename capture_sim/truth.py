@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects.near_lights import illuminate
 from capture_sim.files import write_exr, write_json, write_npz, write_ply, write_silhouette
 from capture_sim.heldout import heldout_pairs, transforms_frame
+from capture_sim.model import Scene
 from capture_sim.rays import Hits, RayTracer, camera_rays, towards_camera, world_from_camera
 from capture_sim.render import (
     PAIRS_PER_BLOCK,
+    arriving_light,
     lit_pairs,
     reflectance_of_pairs,
     sample_view,
     shade,
 )
-from capture_sim.scene import Scene
 from capture_sim.surface import SurfacePoints, surface_points
 
 Table = Mapping[str, Any]
@@ -155,7 +155,7 @@ def lights_visible(scene: Scene, tracer: RayTracer, points: SurfacePoints) -> ND
     step = max(1, PAIRS_PER_BLOCK // len(scene.lights))
     for first in range(0, len(points), step):
         block = points[first : first + step]
-        arriving = illuminate(scene.lights, block.position)
+        arriving = arriving_light(scene, scene.lights, block.position)
         visible[first : first + step] = lit_pairs(scene, tracer, block, arriving)[0]
     return visible
 
@@ -186,7 +186,7 @@ def apparent_brdfs(scene: Scene, tracer: RayTracer) -> Arrays:
     """
     points = area_uniform_points(scene, np.random.default_rng((scene.seed, 2)))
     views = np.stack([towards_camera(c, points.position) for c in scene.cameras], axis=1)
-    arriving = illuminate(scene.lights, points.position)
+    arriving = arriving_light(scene, scene.lights, points.position)
     lit, cosine = lit_pairs(scene, tracer, points, arriving)
     samples = np.zeros((len(points), len(scene.cameras), len(scene.lights), 3), np.float32)
     for view in range(len(scene.cameras)):

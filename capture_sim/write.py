@@ -9,19 +9,21 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import sensor_noise
-from capture_sim.effects.quantisation import expose
+from capture_sim.effects import Frame, exposure_brackets, simulated
+from capture_sim.effects.registry import decided
+from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
 from capture_sim.files import write_exr, write_json, write_png, write_silhouette
+from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
 from capture_sim.render import render_view, sample_view
-from capture_sim.scene import Scene
 from capture_sim.truth import write_truth, write_view_truth
 
 Table = Mapping[str, Any]
@@ -71,7 +73,7 @@ def write_capture(
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
-        _fill(scene, part, workers, progress or (lambda done, total: None))
+        _fill(decided(scene), part, workers, progress or (lambda done, total: None))
         _move_into_place(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -148,22 +150,24 @@ def _write_view(scene: Scene, tracer: RayTracer, index: int, folder: Path) -> No
     camera = scene.cameras[index]
     view = sample_view(scene, tracer, camera)
     write_silhouette(folder / _silhouette(camera), view.coverage)
-    noise = scene.effects.sensor_noise
     for light, radiance in render_view(scene, tracer, view):
-        if noise is not None:
-            radiance = sensor_noise.add_noise(radiance, noise, (scene.seed, index, light))
-        _write_photograph(scene, folder, camera, scene.lights[light], radiance)
+        _write_photograph(scene, folder, Frame(camera, index, light), radiance)
     if scene.truth.per_view:
         write_view_truth(scene, tracer, camera, folder)
 
 
 def _write_photograph(
-    scene: Scene, folder: Path, camera: Table, light: Table, radiance: NDArray[np.float32]
+    scene: Scene, folder: Path, frame: Frame, radiance: NDArray[np.float32]
 ) -> None:
-    if not scene.effects.exposure_seconds:
-        write_exr(folder / _photograph(camera["id"], light["id"]), radiance)
-    for exposure in _exposures(scene, camera, light):
-        write_png(folder / exposure["file"], expose(radiance, exposure["seconds"]))
+    camera, light = frame.camera, scene.lights[frame.light]
+    if not simulated(scene, exposure_brackets):
+        values = exposed(scene, radiance, frame)
+        write_exr(folder / _photograph(camera["id"], light["id"]), values)
+        return
+    for index, exposure in enumerate(_exposures(scene, camera, light)):
+        bracket = replace(frame, exposure=index, seconds=exposure["seconds"])
+        values = exposed(scene, radiance, bracket)
+        write_png(folder / exposure["file"], exposure_brackets.apply(values))
 
 
 def _photograph(camera: str, light: str) -> str:
@@ -175,7 +179,7 @@ def _exposures(scene: Scene, camera: Table, light: Table) -> list[dict[str, Any]
     stem = f"photographs/{camera['id']}_{light['id']}"
     return [
         {"file": f"{stem}_e{index}.png", "seconds": seconds}
-        for index, seconds in enumerate(scene.effects.exposure_seconds)
+        for index, seconds in enumerate(scene.effects.get(exposure_brackets.Options).seconds)
     ]
 
 
@@ -210,7 +214,7 @@ def capture_description(scene: Scene) -> dict[str, Any]:
 
 
 def _photograph_list(scene: Scene) -> dict[str, str] | list[dict[str, Any]]:
-    if not scene.effects.exposure_seconds:
+    if not simulated(scene, exposure_brackets):
         return {"pattern": _photograph("{camera}", "{light}")}
     return [
         {

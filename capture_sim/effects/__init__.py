@@ -1,12 +1,75 @@
 """Physical effects, one module each; a scene pays only for those it calls for.
 
-Every module has `needed(scene)`, which says whether the effect changes this
-scene's photographs and why, and `cost(scene, work)`, what it adds.
+Every module has the same interface:
+
+============================  =====================================================
+``NAME``                      key of the effect in scene files
+``STAGE``                     where in the formation of the image it acts (`Stage`)
+``Options``                   frozen dataclass of its parameters, all with defaults;
+                              the table ``[effects.NAME]`` of the scene is read into it
+``needed(scene)``             `Decision`: a bound on what leaving it out changes, and why
+``cost(scene, work)``         `Cost`: what it adds to the rendering
+``apply(...)``                the effect itself, called only where it is on
+============================  =====================================================
+
+Stages, in the order in which they act, and what ``apply`` gets and returns there:
+
+=============  =======================================================================
+``RIG``        ``apply(rig, scene) -> Rig``: what the rig really is, against what its
+               calibration says; once a capture
+``VIEW``       rays of the pixels; once a view, the same for all lights
+``LIGHT``      direct light that arrives at surface points
+``TRANSPORT``  ``apply(scene, tracer, points, views, lights) -> (n, n_lights, 3)``:
+               radiance that surface points send to the camera beyond direct light
+``OPTICS``     ``apply(radiance, scene, frame) -> radiance``: from the radiance of the
+               scene to what arrives at the pixels
+``SENSOR``     ``apply(values, scene, frame) -> values``: from what arrives to what is
+               recorded
+=============  =======================================================================
+
+`simulated` decides. Code asks it and calls ``apply`` only if the answer is True, so
+that an effect which is off costs nothing.
 """
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+
+from capture_sim.model import Scene, Table
+
+
+class Stage(StrEnum):
+    """Where in the formation of a photograph an effect acts."""
+
+    RIG = "rig"
+    VIEW = "view"
+    LIGHT = "light"
+    TRANSPORT = "transport"
+    OPTICS = "optics"
+    SENSOR = "sensor"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What leaving an effect out would change.
+
+    Attributes
+    ----------
+    reason : str
+        One line for the reader of the plan.
+    bound : float
+        Upper bound on the largest change of any value of any photograph, as a
+        part of that photograph's 99th percentile; infinite if there is none,
+        0 if the effect changes nothing.
+    """
+
+    reason: str
+    bound: float
 
 
 @dataclass(frozen=True)
@@ -51,3 +114,93 @@ class Cost:
 
     rays: int = 0
     operations: int = 0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Which photograph optics and sensor act on.
+
+    Attributes
+    ----------
+    camera : dict
+        Camera of the native capture format.
+    view, light : int
+        Indices of camera and light.
+    exposure : int
+        Index among the exposures of the photograph.
+    seconds : float
+        Exposure time; 1 for photographs that are not bracketed.
+    """
+
+    camera: Table
+    view: int
+    light: int
+    exposure: int = 0
+    seconds: float = 1.0
+
+    def rng(self, scene: Scene, effect: str) -> np.random.Generator:
+        """Generator of this photograph and effect: results depend on no order of work."""
+        name = zlib.crc32(effect.encode())
+        return np.random.default_rng((scene.seed, self.view, self.light, self.exposure, name))
+
+
+class Effect(Protocol):
+    """The part of an effect's module that all stages share."""
+
+    NAME: str
+    STAGE: Stage
+
+    @property
+    def Options(self) -> type:
+        """Dataclass of the effect's parameters."""
+
+    def needed(self, scene: Scene) -> Decision:
+        """Bound what leaving the effect out changes."""
+
+    def cost(self, scene: Scene, work: Workload) -> Cost:
+        """Count what the effect adds."""
+
+
+def threshold(scene: Scene, stage: Stage) -> float:
+    """Change below which an effect is not called for.
+
+    Parameters
+    ----------
+    scene : Scene
+    stage : Stage
+        Of the effect. What the sensor does is not compared with its own noise.
+
+    Returns
+    -------
+    float
+        Part of a photograph's 99th percentile.
+    """
+    if stage is Stage.SENSOR:
+        return scene.effects.tolerance
+    return max(scene.effects.tolerance, scene.brightness.noise)
+
+
+def simulated(scene: Scene, effect: Effect) -> bool:
+    """Tell whether an effect is on.
+
+    Parameters
+    ----------
+    scene : Scene
+    effect : module
+        Of this package.
+
+    Returns
+    -------
+    bool
+        What was decided for the scene, or else what its choice says.
+    """
+    choice = scene.effects
+    if choice.active is not None:
+        return effect.NAME in choice.active
+    if effect.NAME in choice.forced:
+        return choice.forced[effect.NAME]
+    if choice.simulate in ("all", "none"):
+        return choice.simulate == "all"
+    if choice.simulate == "auto":
+        return effect.needed(scene).bound > threshold(scene, effect.STAGE)
+    return effect.NAME in choice.simulate

@@ -7,17 +7,25 @@ measures how much of the pixel each side takes.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Workload
-from capture_sim.scene import Scene
+from capture_sim.effects import Cost, Decision, Stage, Workload
+from capture_sim.model import Scene
 
-NAME = "anti-aliasing"
+NAME = "antialiasing"
+STAGE = Stage.VIEW
 
 
-def needed(scene: Scene) -> tuple[bool, str]:
-    """Tell whether pixels are sampled by more than one ray.
+@dataclass(frozen=True)
+class Options:
+    """None: rays per pixel stand in the table ``[image]``."""
+
+
+def needed(scene: Scene) -> Decision:
+    """Bound what a single ray per pixel changes: an outline turns a pixel on or off.
 
     Parameters
     ----------
@@ -26,18 +34,34 @@ def needed(scene: Scene) -> tuple[bool, str]:
 
     Returns
     -------
-    simulated : bool
-    reason : str
+    Decision
     """
     inside, edge = scene.image.samples_per_side, scene.image.edge_samples_per_side
     if max(inside, edge) == 1:
-        return False, "one ray per pixel was asked for"
-    return True, f"{inside} x {inside} rays inside the object, {edge} x {edge} at outlines"
+        return Decision("one ray per pixel was asked for", 0.0)
+    reason = f"{inside} x {inside} rays inside the object, {edge} x {edge} at outlines"
+    return Decision(reason, scene.brightness.headroom)
 
 
 def cost(scene: Scene, work: Workload) -> Cost:
     """Every pixel is searched for outlines with the finer grid."""
     return Cost(rays=work.n_pixels * scene.image.edge_samples_per_side**2 + work.n_points)
+
+
+def apply(scene: Scene) -> tuple[int, int]:
+    """Rays along each side of a pixel.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    inside, edge : int
+        Inside the object and where an outline crosses the pixel.
+    """
+    inside = scene.image.samples_per_side
+    return inside, max(inside, scene.image.edge_samples_per_side)
 
 
 def sub_pixel_grid(samples_per_side: int) -> NDArray[np.float64]:

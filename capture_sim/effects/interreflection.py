@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from capture_sim.effects import Cost, Workload
-from capture_sim.scene import Scene
+from dataclasses import dataclass
+
+from capture_sim.effects import Cost, Decision, Stage, Workload
+from capture_sim.model import Scene
 
 NAME = "interreflection"
+STAGE = Stage.TRANSPORT
 
 
-def needed(scene: Scene) -> tuple[bool, str]:
+@dataclass(frozen=True)
+class Options:
+    """None."""
+
+
+def needed(scene: Scene) -> Decision:
     """Tell why no light is passed on from the object to itself.
 
     Parameters
@@ -18,13 +26,11 @@ def needed(scene: Scene) -> tuple[bool, str]:
 
     Returns
     -------
-    simulated : bool
-        Always False.
-    reason : str
+    Decision
     """
     if scene.mesh.convex:
-        return False, "a convex object throws no light on itself"
-    return False, "not simulated: photographs hold direct light only"
+        return Decision("a convex object throws no light on itself", 0.0)
+    return Decision("not simulated: photographs hold direct light only", 0.0)
 
 
 def cost(scene: Scene, work: Workload) -> Cost:

@@ -15,19 +15,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Workload
+from capture_sim.effects import Cost, Decision, Stage, Workload
 from capture_sim.errors import SceneError
-from capture_sim.scene import Scene
+from capture_sim.model import Scene
 
-NAME = "near lights"
+NAME = "near_lights"
+STAGE = Stage.LIGHT
 
 Array = NDArray[np.float64]
 
 _FAR = 1e3  # metres to a stand-in for a light at infinity; only shadow rays use it
 
 
-def needed(scene: Scene) -> tuple[bool, str]:
-    """Tell whether any light is at a finite distance.
+@dataclass(frozen=True)
+class Options:
+    """None: lights stand in the table ``[lights]``."""
+
+
+def needed(scene: Scene) -> Decision:
+    r"""Bound the change of irradiance and direction over the object.
+
+    For a light at distance `d` of the centre of an object of radius `r`, the
+    irradiance varies by up to :math:`1 - (1 + r/d)^{-2}` to
+    :math:`(1 - r/d)^{-2} - 1`, and more where direction and shadow change with it.
 
     Parameters
     ----------
@@ -36,18 +46,23 @@ def needed(scene: Scene) -> tuple[bool, str]:
 
     Returns
     -------
-    simulated : bool
-    reason : str
+    Decision
     """
-    near = sum(light["type"] != "directional" for light in scene.lights)
-    if near == 0:
-        return False, "all lights are directional: one direction and irradiance everywhere"
-    return True, f"{near} of {len(scene.lights)} lights stand at a finite distance"
+    near = [light for light in scene.lights if light["type"] != "directional"]
+    if not near:
+        return Decision("all lights are directional: one direction, one irradiance", 0.0)
+    positions = np.array([light["position"] for light in near], dtype=np.float64)
+    distance = np.linalg.norm(positions - scene.mesh.centre, axis=1).min()
+    ratio = scene.mesh.radius / distance
+    reason = f"{len(near)} of {len(scene.lights)} lights stand {distance:.3g} m away or more"
+    change = (1.0 - ratio) ** -2 - 1.0 if ratio < 1.0 else np.inf
+    return Decision(reason, float(scene.brightness.headroom * change))
 
 
 def cost(scene: Scene, work: Workload) -> Cost:
     """One direction and inverse square for each point and light."""
-    return Cost(operations=work.n_points * work.n_lights if needed(scene)[0] else 0)
+    del scene
+    return Cost(operations=work.n_points * work.n_lights)
 
 
 @dataclass(frozen=True)
@@ -69,7 +84,36 @@ class Illumination:
     targets: Array
 
 
-def illuminate(lights: tuple[Mapping[str, Any], ...], points: Array) -> Illumination:
+def far_field(
+    lights: tuple[Mapping[str, Any], ...], centre: Array, points: Array
+) -> Illumination:
+    """What `apply` becomes where the effect is off: the light at the object's centre.
+
+    Parameters
+    ----------
+    lights : tuple of dict
+        Lights of the native capture format.
+    centre : (3,) float
+        Where direction and irradiance are right; world, metres.
+    points : (n, 3) float
+        World, metres.
+
+    Returns
+    -------
+    Illumination
+        The same direction and irradiance at all points.
+    """
+    there = apply(lights, centre[None])
+    shape = (len(points), len(lights), 3)
+    directions = np.broadcast_to(there.directions, shape)
+    return Illumination(
+        directions=directions,
+        irradiance=np.broadcast_to(there.irradiance, shape),
+        targets=points[:, None] + _FAR * directions,
+    )
+
+
+def apply(lights: tuple[Mapping[str, Any], ...], points: Array) -> Illumination:
     """Direction and facing irradiance of every light at every point.
 
     Parameters
@@ -94,7 +138,7 @@ def illuminate(lights: tuple[Mapping[str, Any], ...], points: Array) -> Illumina
     Twice as far gives a quarter:
 
     >>> light = {"id": "l0", "type": "point", "position": [0, 0, 2], "intensity": [8, 8, 8]}
-    >>> arriving = illuminate((light,), np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -2.0]]))
+    >>> arriving = apply((light,), np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -2.0]]))
     >>> arriving.irradiance[:, 0, 0]
     array([2. , 0.5])
     """

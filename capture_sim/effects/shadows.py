@@ -7,19 +7,27 @@ the shading horizon; all else is dark anyway.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Workload
+from capture_sim.effects import Cost, Decision, Stage, Workload
+from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
-from capture_sim.scene import Scene
 from capture_sim.surface import SurfacePoints
 
 NAME = "shadows"
+STAGE = Stage.LIGHT
 
 
-def needed(scene: Scene) -> tuple[bool, str]:
-    """Tell whether the object can shadow itself, and why.
+@dataclass(frozen=True)
+class Options:
+    """None: what casts shadows is the object itself."""
+
+
+def needed(scene: Scene) -> Decision:
+    """Tell whether the object can shadow itself; a shadow takes all light away.
 
     Parameters
     ----------
@@ -28,24 +36,21 @@ def needed(scene: Scene) -> tuple[bool, str]:
 
     Returns
     -------
-    simulated : bool
-    reason : str
+    Decision
     """
-    if scene.effects.shadows == "off":
-        return False, "switched off by effects.shadows"
-    if scene.effects.shadows == "on":
-        return True, "switched on by effects.shadows"
     if scene.mesh.convex:
-        return False, "a convex object cannot shadow itself"
-    return True, "the object is not convex: parts of it hide lights from others"
+        return Decision("a convex object cannot shadow itself", 0.0)
+    reason = "the object is not convex: parts of it hide lights from others"
+    return Decision(reason, scene.brightness.headroom)
 
 
 def cost(scene: Scene, work: Workload) -> Cost:
     """One ray for each point and light above its horizon."""
-    return Cost(rays=work.n_lit if needed(scene)[0] else 0)
+    del scene
+    return Cost(rays=work.n_lit)
 
 
-def unoccluded(
+def apply(
     tracer: RayTracer,
     points: SurfacePoints,
     point: NDArray[np.intp],

@@ -121,7 +121,7 @@ def test_shadows_agree_with_brute_force():
     visible = lights_visible(scene, tracer, points)
     positions = np.array([light["position"] for light in scene.lights])
     starts = points.start + tracer.start_offset * points.face_normal
-    directions = near_lights.illuminate(scene.lights, points.position).directions
+    directions = near_lights.apply(scene.lights, points.position).directions
     above = np.einsum("nlj,nj->nl", directions, points.shading_from_world[:, 2]) > 0
     reached = np.stack(
         [
@@ -142,7 +142,7 @@ def test_tracing_a_convex_object_changes_nothing():
         image={"samples_per_side": 1},
     )
     untraced = photographs(scene)
-    traced = photographs(replace(scene, effects=EffectOptions(shadows="on")))
+    traced = photographs(replace(scene, effects=EffectOptions(forced={"shadows": True})))
     # Rays start on the smooth surface, so the facets draw no line along the terminator.
     np.testing.assert_allclose(traced, untraced, atol=2e-3 * untraced.max())
 

@@ -21,7 +21,8 @@ def test_defaults():
     scene = parse_scene(tables(), default_name="ball")
     assert (scene.name, scene.base_geometry, scene.heldout_frames) == ("ball", "hull", 0)
     assert (scene.image.samples_per_side, scene.image.edge_samples_per_side) == (2, 4)
-    assert scene.effects.sensor_noise is None
+    assert (scene.effects.simulate, scene.effects.tolerance) == ("auto", 1e-3)
+    assert scene.effects.parameters == ()
 
 
 @pytest.mark.parametrize(
@@ -41,14 +42,26 @@ def test_defaults():
         ({"cameras": {"preset": "rti", "zoom": 2}}, r"cameras: expected keys .*'zoom'"),
         ({"image": {"samples_per_side": 0}}, r"image\.samples_per_side: .*received 0"),
         ({"image": {"samples": 4}}, r"image: expected keys .*samples_per_side.*'samples'"),
-        ({"effects": {"shadows": "maybe"}}, r"effects\.shadows: expected one of auto, on, off"),
-        ({"effects": {"sensor_noise": {}}}, r"electrons_per_radiance: expected a value"),
+        ({"effects": "some"}, r"effects: expected auto, all, none or a list.*received some"),
+        ({"effects": ["glow"]}, r"effects: expected names among .*shadows.*'glow'"),
+        ({"effects": 3}, r"effects: expected a table, received 3"),
+        ({"effects": {"glow": "on"}}, r"effects: expected keys .*shadows.*received 'glow'"),
+        ({"effects": {"simulate": 1}}, r"effects\.simulate: expected auto, all, none"),
+        ({"effects": {"tolerance": -1}}, r"effects\.tolerance: expected a number in \[0, 1\]"),
+        ({"effects": {"shadows": "maybe"}}, r"effects\.shadows: .* one of auto, on, off"),
+        ({"effects": {"shadows": {"soft": 1}}}, r"effects\.shadows: expected keys none"),
         (
-            {"effects": {"sensor_noise": {"electrons_per_radiance": 1, "read_noise": -1}}},
-            r"read_noise: expected a number",
+            {"effects": {"sensor_noise": {"read_noise": -1}}},
+            r"effects\.sensor_noise\.read_noise: expected a number",
         ),
-        ({"effects": {"exposure_seconds": [1.0, 0.0]}}, r"exposure_seconds: expected a number"),
-        ({"effects": {"exposure_seconds": 1.0}}, r"exposure_seconds: expected a list"),
+        (
+            {"effects": {"exposure_brackets": {"seconds": [1.0, 0.0]}}},
+            r"exposure_brackets\.seconds: expected a number",
+        ),
+        (
+            {"effects": {"exposure_brackets": {"seconds": 1.0}}},
+            r"exposure_brackets\.seconds: expected a list",
+        ),
         ({"heldout": {"frames": -2}}, r"heldout\.frames"),
         ({"truth": {"per_view": 1}}, r"truth\.per_view: expected true or false"),
     ],

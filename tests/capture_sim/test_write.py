@@ -198,7 +198,7 @@ def test_bracketed_exposures_merge_to_the_linear_photograph(tmp_path):
 
     plain = {"heldout": {"frames": 0}, "truth": {"points": 0, "per_view": False}}
     linear = write_capture(scene(effects={}, **plain), tmp_path / "linear")
-    times = {"exposure_seconds": [0.02, 0.2, 2.0]}
+    times = {"exposure_brackets": {"seconds": [0.02, 0.2, 2.0]}}
     bracketed = write_capture(scene(effects=times, **plain), tmp_path / "bracketed")
     description = json.loads((bracketed / "capture.json").read_text())
     jsonschema.validate(description, json.loads(SCHEMA.read_text()))
