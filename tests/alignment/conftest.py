@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
+HERE = Path(__file__).resolve().parent
+EXAMPLES = HERE.parents[1] / "examples"
 
-def _module(name):
-    path = Path(__file__).with_name(f"{name}.py")
-    spec = importlib.util.spec_from_file_location(name, path)
+
+def _module(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -17,10 +19,16 @@ def _module(name):
 @pytest.fixture(scope="session")
 def scene():
     """The synthetic scene of the paper's section 5.1."""
-    return _module("scene")
+    return _module(EXAMPLES / "synthetic_btf.py")
 
 
 @pytest.fixture(scope="session")
 def references():
     """Correlation by the paper's own sums."""
-    return _module("references")
+    return _module(HERE / "references.py")
+
+
+@pytest.fixture(scope="session")
+def paper_forms():
+    """The paper's sums on whole grids of rotations."""
+    return _module(HERE / "paper_forms.py")

@@ -1,4 +1,9 @@
-"""The synthetic scene of the paper's section 5.1, rebuilt: frames, directions, samples."""
+"""The synthetic scene of the paper's section 5.1, rebuilt: frames, directions, samples.
+
+A raised ring and bars on a plane, tangents modulated by cosines, one anisotropic
+material (M. Ashikhmin, P. Shirley, "An anisotropic Phong BRDF model", 2000). The examples,
+the tests of the alignment and its benchmark all use it.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,16 @@ import numpy as np
 
 from reflfield.sphere.rotations import frames_from_normals
 
+RINGS_81 = ((0, 1), (17, 8), (34, 16), (51, 24), (68, 32))
+# Of the dome that the paper's measurements come from, without the offsets of its rings.
+RINGS_151 = (
+    (0, 1), (11, 6), (23.5, 12), (30, 12), (37.5, 12),
+    (45, 18), (52.5, 18), (60, 24), (67.5, 24), (75, 24),
+)  # fmt: skip
 
-def dome_directions(rings=((0, 1), (17, 8), (34, 16), (51, 24), (68, 32))):
-    """Directions of a dome, 81 by default: polar angle in degrees and count of each ring."""
+
+def dome_directions(rings=RINGS_81):
+    """Directions of a dome: polar angle in degrees and count of each ring."""
     parts = []
     for polar, count in rings:
         azimuth = 2 * np.pi * (np.arange(count) + 0.5 * (polar % 2)) / count
@@ -26,7 +38,7 @@ def dome_directions(rings=((0, 1), (17, 8), (34, 16), (51, 24), (68, 32))):
     return np.concatenate(parts)
 
 
-def relief_frames(width=124, height=90, slope=1.0):
+def relief_frames(width=124, height=90, slope=0.6):
     """Frames (n, 3, 3) of a raised ring with soft edges and cosine-modulated tangents."""
     x, y = np.meshgrid(np.linspace(-1.4, 1.4, width), np.linspace(-1.0, 1.0, height))
     radius = np.hypot(x, y)
@@ -77,6 +89,20 @@ def sample_texels(frames, views, lights, block=128, **material):
             ).astype(np.float32)
         )
     return np.concatenate(parts)
+
+
+def with_the_truths_tangents(found, truth):
+    """Recovered frames, all turned alike about their normals so that tangents agree on average.
+
+    Data determine the mean tangent of a material only up to such a turn, and this
+    anisotropic one every tangent only up to a half turn.
+    """
+    sign = np.sign(np.sum(found[:, 0] * truth[:, 0], axis=1))
+    folded = found * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, :, None]
+    turn = np.einsum("nij,nkj->ik", truth, folded)
+    angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ folded
 
 
 def frame_errors(found, truth, half_turn=True):
