@@ -14,6 +14,7 @@ from reflfield.observations.resampling import (
     ResamplingOptions,
     RootedSamples,
     TexelSamples,
+    local_directions,
     resample,
     rooted_samples,
     side_for,
@@ -22,6 +23,9 @@ from reflfield.observations.store import ObservationStore
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
+
+# Rec.709 luminance: what alignment correlates.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
@@ -33,6 +37,23 @@ def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
     view = 1 if capture.n_views == 1 else options.view_side or side_for(capture.n_views)
     light = 1 if n_lights == 1 else options.light_side or side_for(n_lights)
     return view, light
+
+
+@dataclass(frozen=True, eq=False)
+class LocalLuminance:
+    """Luminance of some texels' samples, with their directions in the texels' frames.
+
+    Parameters
+    ----------
+    samples : (n, n_views, n_lights) float32
+        Linear, 1/sr, the light's cosine included; NaN where not observed.
+    views, lights : (n, n_views, 3), (n, n_lights, 3) float64
+        Unit vectors. A direction that does not vary has one entry, z.
+    """
+
+    samples: Floats
+    views: NDArray[np.float64]
+    lights: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +102,14 @@ class TexelReader:
         """Return a reader of the same samples in other frames."""
         return replace(self, local_from_world=local_from_world)
 
-    def rooted(self, texels: Indices) -> RootedSamples:
-        """Samples (in the domain), taps and weights of some texels."""
+    def measured(self, texels: Indices) -> TexelSamples:
+        """Samples of some texels with their directions in the world."""
         positions = self.positions[texels]
         views, lights = directions_of(self.capture, positions)
         # Outside a spot's cone the sample says nothing, though no shadow falls there.
         lit = facing_irradiance(self.capture.lights, positions).any(axis=2)
         observed = self.store.observed
-        samples = TexelSamples(
+        return TexelSamples(
             samples=self.store.read(texels),
             views=views,
             lights=lights,
@@ -96,12 +117,40 @@ class TexelReader:
             light_seen=observed.lights[texels] & lit,
             pairs=observed.pairs,
         )
+
+    def rooted(self, texels: Indices) -> RootedSamples:
+        """Samples (in the domain), taps and weights of some texels."""
         frames = np.ascontiguousarray(self.local_from_world[texels], np.float32)
-        return rooted_samples(samples, frames, self.sides, self.options.domain)
+        return rooted_samples(self.measured(texels), frames, self.sides, self.options.domain)
+
+    def luminance(self, texels: Indices) -> LocalLuminance:
+        """Luminance of the samples of some texels, as measured, and where they stand."""
+        found = self.measured(texels)
+        seen = found.view_seen[:, :, None] & found.light_seen[:, None] & found.pairs
+        samples = np.where(seen, found.samples.astype(np.float32) @ LUMINANCE, np.nan)
+        frames = self.local_from_world[texels].astype(np.float64)
+        views = local_directions(frames, found.views.astype(np.float64))
+        lights = local_directions(frames, found.lights.astype(np.float64))
+        if self.sides[0] == 1:
+            samples, views = _mean_over(samples, 1), _upright(len(texels))
+        if self.sides[1] == 1:
+            samples, lights = _mean_over(samples, 2), _upright(len(texels))
+        return LocalLuminance(samples, views, lights)
 
     def nodes(self, texels: Indices) -> Nodes:
         """Texels resampled onto the nodes of their frames."""
         return resample(self.rooted(texels), self.sides, self.options.smoothness)
+
+
+def _mean_over(samples: Floats, axis: int) -> Floats:
+    """Mean of the observed samples along an axis, which is kept; NaN where there is none."""
+    count = np.isfinite(samples).sum(axis=axis, keepdims=True)
+    total = np.nansum(samples, axis=axis, keepdims=True)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _upright(n: int) -> NDArray[np.float64]:
+    return np.tile([0.0, 0.0, 1.0], (n, 1, 1))
 
 
 @dataclass(frozen=True, eq=False)

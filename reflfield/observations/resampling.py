@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from reflfield.sphere.hemisphere import HORIZON_SOFTNESS, HemisphereGrid, soften
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
+Directions = TypeVar("Directions", NDArray[np.float32], NDArray[np.float64])
 
 POWERS = {"cube_root": 3.0, "square_root": 2.0, "linear": 1.0}
 
@@ -198,8 +200,8 @@ class TexelSamples:
     pairs: Bools
 
 
-def local_directions(local_from_world: Floats, directions: Floats) -> Floats:
-    """Directions (n, k, 3) of the world in the texels' frames (n, 3, 3).
+def local_directions(local_from_world: Directions, directions: Directions) -> Directions:
+    """Directions (n, k, 3) of the world in the texels' frames (n, 3, 3), in their precision.
 
     Examples
     --------

@@ -24,7 +24,7 @@ from reflfield.field.model import (
     build_field,
 )
 from reflfield.observations.projection import project_photographs
-from reflfield.observations.reading import TexelReader
+from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
@@ -34,9 +34,6 @@ from reflfield.steps.job import Job
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
-
-# Rec.709 luminance: what alignment correlates.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def write_observations(job: Job, folder: Path) -> dict[str, Any]:

@@ -160,3 +160,46 @@ class TestColumns:
         assert np.isfinite(values).all()
         assert not values[:, 1].any()
         assert weights.any(axis=0).tolist() == [True, False, True]
+
+
+class TestLuminance:
+    def test_is_the_raw_sample_where_observed_and_nan_elsewhere(self, reader_of, rng):
+        lights = rng.random((9, 4)) < 0.5
+        views = rng.random((9, 5)) < 0.5
+        capture = dome(5, 4, missing={(2, 3)})
+        reader = reader_of(capture, rng.random((9, 5, 4, 3)), views=views, lights=lights)
+        texels = np.array([8, 1, 3])
+        found = reader.luminance(texels)
+        seen = views[texels][:, :, None] & lights[texels][:, None] & pairs_photographed(capture)
+        np.testing.assert_array_equal(np.isfinite(found.samples), seen)
+        red, green, blue = np.moveaxis(reader.store.read(texels).astype(float), 3, 0)
+        expected = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+        eps = np.finfo(np.float32).eps
+        np.testing.assert_allclose(found.samples[seen], expected[seen], rtol=4 * eps)
+
+    def test_directions_are_those_to_cameras_and_lights_in_the_frame(self, reader):
+        texels = np.array([31, 4])
+        found = reader.luminance(texels)
+        for i, t in enumerate(texels):
+            towards = np.stack([light.position for light in reader.capture.lights])
+            towards = towards - reader.positions[t]
+            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+            expected = towards @ reader.local_from_world[t].T.astype(float)
+            # Directions of the world are handed on as float32.
+            eps = np.finfo(np.float32).eps
+            np.testing.assert_allclose(found.lights[i], expected, atol=4 * eps)
+        assert found.views.shape == (2, 6, 3)
+
+    def test_directions_that_do_not_vary_become_one(self, reader_of, rng):
+        unknown = tuple(Light(f"l{i}", "unknown") for i in range(3))
+        samples = rng.random((4, 1, 3, 3))
+        lights = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 0]], bool)
+        reader = reader_of(dome(1, 3, lights=unknown), samples, sides=(1, 1), lights=lights)
+        found = reader.luminance(np.arange(4))
+        assert found.samples.shape == (4, 1, 1)
+        value = samples.astype(np.float16).astype(float) @ [0.2126, 0.7152, 0.0722]
+        assert np.isnan(found.samples[2, 0, 0])
+        np.testing.assert_allclose(
+            found.samples[1, 0, 0], value[1, 0, [0, 2]].mean(), rtol=1e-6
+        )
+        np.testing.assert_array_equal(found.lights, np.tile([0.0, 0, 1], (4, 1, 1)))
