@@ -12,11 +12,14 @@ backprojection,
 where :math:`T_i` interpolates at the sample directions in the frame of texel i and
 :math:`s_i` is its brightness. Frames and brightness then follow by Gauss-Newton steps
 on the weighted squares of :math:`y_i - s_i T_i c`; samples below either horizon of
-the frame are left out. Both are repeated.
+the frame are left out. Both are repeated. A Gaussian prior may hold each frame to the one
+given: with :math:`\omega` the turn between them, :math:`v |\omega|^2 / \text{spread}^2` is
+added to the squares, :math:`v` being the texel's weighted squared residual per sample.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numba
@@ -27,6 +30,7 @@ from reflfield.alignment.correlation import copy_matrix, turned
 from reflfield.alignment.correlation import scale as shrink
 from reflfield.alignment.searching import map_blocks
 from reflfield.checks import check_shape
+from reflfield.errors import InputError
 from reflfield.sphere.hemisphere import first_tap, square_from_xyz
 
 # Half of the step by which the taps' positions are differenced, radians: well below the
@@ -63,6 +67,9 @@ class RefinementOptions:
         texel's root mean square.
     texels_per_cluster : int
         Texels that the target is fitted to.
+    spread : float
+        Standard deviation of the frames given about the true ones, radians: a Gaussian
+        prior holds texels there that few or noisy samples say little about. Infinite: none.
     """
 
     side: int = 25
@@ -72,6 +79,11 @@ class RefinementOptions:
     last_steps: int = 5
     floor: float = 0.3
     texels_per_cluster: int = 2048
+    spread: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.spread > 0:
+            raise InputError(f"spread: expected radians > 0, received {self.spread}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,6 +342,48 @@ def _add_row(
             for m in range(n + 1):
                 normal[n, m] += weight * jacobian[n] * jacobian[m]
         normal[0, 4] += weight
+        normal[1, 4] += 1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_views(
+    samples: NDArray[np.float32],
+    target: NDArray[np.float32],
+    nodes: tuple[NDArray[np.int64], NDArray[np.int64]],
+    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    sides: tuple[int, int],
+    scale_and_floor: tuple[float, float],
+    lines: NDArray[np.float32],
+    normal: NDArray[np.float64],
+) -> None:
+    """Add one texel's samples to its normal equations; `lines` is scratch."""
+    scale, floor = scale_and_floor
+    for v in range(samples.shape[0]):
+        if nodes[0][v] >= 0:
+            place = places[0][v]
+            _blend(target, nodes[0][v], sides[0], place[0], place[1], lines)
+            _add_row(
+                samples[v], place, lines, nodes[1], places[1], sides[1], scale, floor, normal
+            )
+
+
+@numba.njit(cache=True, nogil=True)
+def _hold(
+    frame: NDArray[np.float64],
+    start: NDArray[np.float64],
+    strength: float,
+    normal: NDArray[np.float64],
+) -> None:
+    """Add the prior on the turn from `start` to `frame` to the normal equations."""
+    away = np.zeros(3)
+    for k in range(3):
+        # Turns of a few degrees: their vector is the skew part of frame @ start^T.
+        a, b = (k + 1) % 3, (k + 2) % 3
+        for c in range(3):
+            away[k] += 0.5 * (frame[b, c] * start[a, c] - frame[a, c] * start[b, c])
+        normal[k, k] += strength
+        normal[4, k] -= strength * away[k]
+        normal[4, 4] += strength * away[k] * away[k]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -398,9 +452,15 @@ def improve(
     target: NDArray[np.float32],
     sides: tuple[int, int],
     relative_floor: float,
+    starts: NDArray[np.float64],
+    spread: float,
     n_steps: int,
 ) -> None:
-    """Gauss-Newton steps of frames and brightness of some texels, in place."""
+    """Gauss-Newton steps of frames and brightness of some texels, in place.
+
+    The prior weighs against the samples by their weighted squared residual at first, over
+    the samples less the four unknowns.
+    """
     n_views, n_lights = samples.shape[1:]
     v_nodes, v_places = np.zeros(n_views, np.int64), np.zeros((n_views, 8))
     l_nodes, l_places = np.zeros(n_lights, np.int64), np.zeros((n_lights, 8))
@@ -410,28 +470,26 @@ def improve(
     for i in range(samples.shape[0]):
         if brightness[i] <= 0.0:
             continue
-        floor, least = relative_floor * brightness[i], np.inf
+        floor, least, strength = relative_floor * brightness[i], np.inf, 0.0
         copy_matrix(frames[i], frame)
         for n in range(n_steps + 1):
             normal[:] = 0.0
             scale = brightness[i] * scale_factor if n > 0 else brightness[i]
             _place(views[i % len(views)], frame, sides[0], v_nodes, v_places)
             _place(lights[i % len(lights)], frame, sides[1], l_nodes, l_places)
-            for v in range(n_views):
-                if v_nodes[v] >= 0:
-                    place = v_places[v]
-                    _blend(target, v_nodes[v], sides[0], place[0], place[1], lines)
-                    _add_row(
-                        samples[i, v],
-                        place,
-                        lines,
-                        l_nodes,
-                        l_places,
-                        sides[1],
-                        scale,
-                        floor,
-                        normal,
-                    )
+            _add_views(
+                samples[i],
+                target,
+                (v_nodes, l_nodes),
+                (v_places, l_places),
+                sides,
+                (scale, floor),
+                lines,
+                normal,
+            )
+            if n == 0:
+                strength = normal[4, 4] / max(normal[1, 4] - 4.0, 1.0) / (spread * spread)
+            _hold(frame, starts[i], strength, normal)
             cost = normal[4, 4] / max(normal[0, 4], 1e-300)
             if cost < least:
                 least = cost
@@ -514,8 +572,13 @@ def improve_frames(
     options: RefinementOptions,
     n_steps: int,
     n_threads: int,
+    starts: NDArray[np.float64] | None = None,
 ) -> None:
-    """Gauss-Newton steps of frames and brightness, in place; parameters as `fit_nodes`."""
+    """Gauss-Newton steps of frames and brightness, in place; parameters as `fit_nodes`.
+
+    The prior, if any, holds the frames to `starts`, (n, 3, 3), or to where they are.
+    """
+    starts = frames.copy() if starts is None else starts
     sides = (targets.view_side, targets.light_side)
 
     def block(rows: slice) -> None:
@@ -531,6 +594,8 @@ def improve_frames(
                 targets.values[k],
                 sides,
                 options.floor,
+                starts[own],
+                options.spread,
                 n_steps,
             )
             frames[own], brightness[own] = frame, bright
@@ -564,13 +629,21 @@ def refine_targets(
     targets : NodeTargets
     frames : (n, 3, 3) float64
     """
-    frames, brightness = frames.copy(), data.brightness()
+    starts, frames, brightness = frames, frames.copy(), data.brightness()
     sides = [1 if count == 1 else options.side for count in data.samples.shape[1:]]
     empty = np.zeros((n_clusters, sides[0] ** 2, sides[1] ** 2), np.float32)
     targets = NodeTargets(empty, sides[0], sides[1])
     for _ in range(options.rounds):
         targets = fit_nodes(data, frames, brightness, cluster, targets, options, n_threads)
         improve_frames(
-            data, frames, brightness, cluster, targets, options, options.steps, n_threads
+            data,
+            frames,
+            brightness,
+            cluster,
+            targets,
+            options,
+            options.steps,
+            n_threads,
+            starts,
         )
     return targets, frames
