@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
 from reflfield.alignment.searching import (
     SearchOptions,
     SearchResult,
-    follow,
     map_blocks,
     search,
 )

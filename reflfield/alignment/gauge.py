@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
-from reflfield.alignment.searching import follow, rotation_about
+from reflfield.alignment.searching import rotation_about
 from reflfield.sphere.coupling import Coupled, rotate_coupled
 from reflfield.sphere.rotations import frames_from_normals
 from reflfield.sphere.wigner import rotation_blocks

@@ -26,8 +26,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.correlation import copy_matrix, turned
-from reflfield.alignment.correlation import scale as shrink
+from reflfield.alignment.climbing import copy_matrix, turned
+from reflfield.alignment.climbing import scale as shrink
 from reflfield.alignment.searching import map_blocks
 from reflfield.checks import check_shape
 from reflfield.errors import InputError

@@ -4,36 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import ThreadpoolController
 
-from reflfield.alignment.correlation import (
-    COARSE_DEGREES,
-    COARSE_ROTATIONS,
+from reflfield.alignment.climbing import (
+    APPROACH_DEGREES,
     PEAK_DISTANCE,
-    POLISHING_STEPS,
-    SCREENING_DEGREE,
-    SCREENING_STEPS,
-    climb,
-    coarse_grid,
-    highest_maxima,
-    spectrum,
+    climb_best,
+    degree_arrays,
+    degrees_of,
+    follow,
+    lowest_z_of,
 )
+from reflfield.alignment.coarse import coarse_peaks
+from reflfield.alignment.correlation import spectrum
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
 from reflfield.sphere.coupling import Coupled
-from reflfield.sphere.wigner import block_offsets, degree_tables
 
 # Functions handled together: their series and coarse values stay within a few MB.
 BLOCK = 256
 N_PEAKS = 4
 # Targets whose coarse peak is among the best few are searched with all degrees.
 N_FINALISTS = 3
-# Peaks that reach less than this share of the highest after one step are given up.
-HOPEFUL = 0.9
 Result = TypeVar("Result")
 
 
@@ -153,12 +152,24 @@ def search(
 def map_blocks(
     work: Callable[[slice], Result], n: int, size: int, n_threads: int
 ) -> list[Result]:
-    """Results of `work` on consecutive blocks of rows, in order."""
+    """Results of `work` on consecutive blocks of rows, in order; one core a thread."""
     blocks = [slice(first, min(first + size, n)) for first in range(0, max(n, 1), size)]
-    if n_threads == 1 or len(blocks) == 1:
-        return [work(block) for block in blocks]
-    with ThreadPoolExecutor(n_threads) as pool:
-        return list(pool.map(work, blocks))
+    with one_core_blas():
+        if n_threads == 1 or len(blocks) == 1:
+            return [work(block) for block in blocks]
+        with ThreadPoolExecutor(n_threads) as pool:
+            return list(pool.map(work, blocks))
+
+
+def one_core_blas() -> AbstractContextManager[object]:
+    """Keep the BLAS from threads of its own: the blocks have theirs, and two layers fight."""
+    return _thread_pools().limit(limits=1, user_api="blas")
+
+
+@lru_cache(maxsize=1)
+def _thread_pools() -> ThreadpoolController:
+    """Libraries with threads in this process; finding them takes milliseconds."""
+    return ThreadpoolController()
 
 
 def _check_search(
@@ -188,9 +199,10 @@ class _Plan:
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """Rotations in question: `rows` sorted, one entry per function and candidate."""
+    """Rotations in question: those of function ``rows[i]`` are ``first[i] .. first[i + 1]``."""
 
     rows: NDArray[np.int64]
+    first: NDArray[np.int64]
     rotations: NDArray[np.float64]
 
 
@@ -199,10 +211,9 @@ def _search_block(
 ) -> SearchResult:
     """Search of a few functions against all (unit) targets."""
     norms = source.norms()
-    # Unit functions, so that the float32 kernels never meet 1e-12 or 1e12.
-    source = source.units()
-    series = [spectrum(source, target) for target in plan.targets]
-    coarse = [_coarse_peaks(s, source.n_degrees, plan) for s in series]
+    # Unit series, so that the float32 kernels never meet 1e-12 or 1e12.
+    series = [_unit_series(source, norms, target) for target in plan.targets]
+    coarse = [coarse_peaks(s, source.n_degrees, plan.n_peaks, plan.max_tilt) for s in series]
     best = SearchResult(
         rotations=np.tile(np.eye(3), (len(source), 1, 1)),
         score=np.full(len(source), -np.inf),
@@ -222,17 +233,14 @@ def _search_block(
     return best
 
 
-def _coarse_peaks(
-    series: NDArray[np.floating], n_degrees: int, plan: _Plan
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n, n_peaks, 3, 3) rotations of the coarse maxima (NaN: fewer) and the highest value."""
-    low = min(n_degrees, COARSE_DEGREES)
-    grid = coarse_grid(low, COARSE_ROTATIONS, plan.max_tilt, str(series.dtype))
-    values = series[:, : block_offsets(low)[-1]] @ grid.blocks.T
-    found = np.full((len(series), plan.n_peaks), -1, np.int32)
-    highest_maxima(values, grid.neighbours, found)
-    rotations = np.where(found[:, :, None, None] >= 0, grid.rotations[found], np.nan)
-    return rotations, values.max(axis=1).astype(np.float64)
+def _unit_series(
+    source: Coupled, norms: NDArray[np.float64], target: Coupled
+) -> NDArray[np.floating]:
+    """Series of unit functions; zero for zero functions."""
+    series = spectrum(source, target)
+    factors = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
+    series *= factors.astype(series.dtype)[:, None]
+    return series
 
 
 def _candidates(
@@ -242,62 +250,11 @@ def _candidates(
     every = peaks[final]
     if start is not None:
         every = np.concatenate([start[final][:, None], every], axis=1)
-    rows = np.repeat(final, every.shape[1])
     flat = every.reshape(-1, 3, 3)
     real = np.isfinite(flat[:, 0, 0])
-    return _Candidates(rows[real], flat[real])
-
-
-def follow(
-    series: NDArray[np.floating],
-    rows: NDArray[np.int64],
-    rotations: NDArray[np.float64],
-    n_steps: int,
-    max_tilt: float | None = None,
-    highest: int | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Climb from each rotation, by default with all degrees.
-
-    Parameters
-    ----------
-    series : (n, k) float
-        See `spectrum`.
-    rows : (c,) int64
-        Series that each rotation climbs on.
-    rotations : (c, 3, 3) float64
-        Where to begin.
-    n_steps : int
-        0: evaluate only.
-    max_tilt : float, optional
-        Radians.
-    highest : int, optional
-        Only degrees up to this are used.
-
-    Returns
-    -------
-    rotations : (c, 3, 3) float64
-    found : (c, 11) float64
-        Value, gradient, Hessian (xx, yy, zz, xy, xz, yz), length of the next step.
-    """
-    n_degrees = int(np.searchsorted(block_offsets(64), series.shape[1]))
-    tables = degree_tables(n_degrees, str(series.dtype))
-    used = n_degrees if highest is None else min(highest + 1, n_degrees)
-    moved = np.ascontiguousarray(rotations, dtype=np.float64).copy()
-    found = np.zeros((len(moved), 11))
-    lowest_z = -2.0 if max_tilt is None else float(np.cos(max_tilt))
-    climb(
-        series,
-        np.ascontiguousarray(rows, dtype=np.int64),
-        moved,
-        n_steps,
-        lowest_z,
-        tables.row_start[: used + 1],
-        tables.recursion,
-        tables.edge,
-        tables.ladder,
-        found,
-    )
-    return moved, found
+    counts = real.reshape(len(final), every.shape[1]).sum(axis=1)
+    first = np.concatenate([[0], np.cumsum(counts)])
+    return _Candidates(final, first, flat[real])
 
 
 def _keep_better(
@@ -308,84 +265,32 @@ def _keep_better(
     plan: _Plan,
 ) -> None:
     """Update `best` in place with target k for the functions that have candidates."""
-    if len(candidates.rows) == 0:
+    who = candidates.rows
+    if len(who) == 0:
         return
-    rows, moved, values = _screen(series, candidates, plan.max_tilt)
-    first = best_of_each(rows, values)
-    who = rows[first]
-    top, at_top = follow(series, who, moved[first], POLISHING_STEPS, plan.max_tilt)
+    n_degrees, dtype = degrees_of(series), str(series.dtype)
+    top, at_top = np.zeros((len(who), 3, 3)), np.zeros((len(who), 11))
+    rival = np.zeros(len(who))
+    climb_best(
+        series,
+        who,
+        candidates.first,
+        candidates.rotations,
+        lowest_z_of(plan.max_tilt),
+        bool(plan.half_turns) and plan.half_turns[k],
+        degree_arrays(min(n_degrees, APPROACH_DEGREES), dtype),
+        degree_arrays(n_degrees, dtype),
+        top,
+        at_top,
+        rival,
+    )
     better = at_top[:, 0] > best.score[who]
     best.rotations[who[better]] = top[better]
     best.score[who[better]] = at_top[better, 0]
     best.cluster[who[better]] = k
     if plan.margins:
-        half_turn = bool(plan.half_turns) and plan.half_turns[k]
-        apart = _apart(rows, moved, who, top, half_turn)
-        gap = np.minimum(
-            _gap_to_other_peaks(rows[apart], values[apart], who, at_top[:, 0]),
-            _gap_of_weakest_turn(series, who, top, at_top),
-        )
+        gap = np.minimum(at_top[:, 0] - rival, _gap_of_weakest_turn(series, who, top, at_top))
         best.margin[who[better]] = np.maximum(gap, 0.0)[better]
-
-
-def _screen(
-    series: NDArray[np.floating], candidates: _Candidates, max_tilt: float | None
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Rows, rotations and values of the candidates after the steps each deserves."""
-    rows = candidates.rows
-    moved, found = follow(series, rows, candidates.rotations, 1, max_tilt, SCREENING_DEGREE)
-    values = found[:, 0]
-    highest = values[best_of_each(rows, values)]
-    index = np.cumsum(np.concatenate([[0], np.diff(rows) > 0]))
-    hopeful = values >= HOPEFUL * highest[index]
-    # One that stands alone is the best already, and goes straight to its peak.
-    together = np.bincount(index[hopeful], minlength=len(highest))
-    near = np.flatnonzero(hopeful & (together[index] > 1))
-    moved[near], found = follow(series, rows[near], moved[near], SCREENING_STEPS, max_tilt)
-    values[near] = found[:, 0]
-    return rows, moved, values
-
-
-def best_of_each(rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of the highest value within each run of equal rows.
-
-    Examples
-    --------
-    >>> best_of_each(np.array([0, 0, 3, 3]), np.array([1.0, 2.0, 5.0, 4.0]))
-    array([1, 2])
-    """
-    order = np.lexsort((np.arange(len(rows)), -values, rows))
-    return order[np.concatenate([[True], np.diff(rows[order]) > 0])]
-
-
-def _apart(
-    rows: NDArray[np.int64],
-    moved: NDArray[np.float64],
-    who: NDArray[np.int64],
-    top: NDArray[np.float64],
-    half_turn: bool,
-) -> NDArray[np.bool_]:
-    """True for candidates that ended elsewhere than the best of their function."""
-    product = moved * top[np.searchsorted(who, rows)]
-    columns = product.sum(axis=1)
-    limit = 1.0 + 2.0 * np.cos(PEAK_DISTANCE)
-    apart = columns.sum(axis=1) < limit
-    if half_turn:
-        apart &= columns[:, 2] - columns[:, 0] - columns[:, 1] < limit
-    return apart
-
-
-def _gap_to_other_peaks(
-    rows: NDArray[np.int64],
-    values: NDArray[np.float64],
-    who: NDArray[np.int64],
-    height: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Height above the best of the candidates that ended elsewhere."""
-    index = np.searchsorted(who, rows)
-    gap = np.full(len(who), np.inf)
-    np.minimum.at(gap, index, height[index] - values)
-    return gap
 
 
 def _gap_of_weakest_turn(

@@ -150,9 +150,9 @@ class DegreeTables:
         d^j = (recursion[0] * cos(beta) - recursion[1]) d^{j-1} - recursion[2] d^{j-2}.
     edge : (degree_limit, width) float
         Factors of the last row of each degree.
-    ladder : (6, n) float
-        Order n; c+; c-; c+ c+; c- c-; j (j + 1) - n^2, the matrix elements of
-        the generators that the derivatives need.
+    ladder : (5, n) float
+        Order n; c+; c-; c+ c+; c- c-, the matrix elements of the generators that the
+        derivatives need.
     """
 
     degree_limit: int
@@ -175,12 +175,12 @@ def degree_tables(degree_limit: int, dtype: str = "float32") -> DegreeTables:
     width = row_width(degree_limit)
     start = width * (degrees * (degrees + 1) // 2)
     recursion = np.zeros((3, start[-1]))
-    ladder = np.zeros((6, start[-1]))
+    ladder = np.zeros((5, start[-1]))
     edge = np.zeros((degree_limit, width))
     for j in range(degree_limit):
         part = slice(start[j], start[j + 1])
         recursion[:, part] = _recursion_of_degree(j, width).reshape(3, -1)
-        ladder[:, part] = _ladder_of_degree(j, width).reshape(6, -1)
+        ladder[:, part] = _ladder_of_degree(j, width).reshape(5, -1)
         n = np.arange(-j + 1, j)
         growth = np.sqrt(2.0 * j * (2.0 * j - 1.0) / ((j + n) * (j - n)))
         edge[j, n + width // 2] = growth
@@ -221,14 +221,14 @@ def _recursion_of_degree(j: int, width: int) -> NDArray[np.float64]:
 
 
 def _ladder_of_degree(j: int, width: int) -> NDArray[np.float64]:
-    """(6, j + 1, width) generator elements of degree j, the same for every row."""
+    """(5, j + 1, width) generator elements of degree j, the same for every row."""
     n = np.arange(-j, j + 1, dtype=np.float64)
     up = np.sqrt((j - n) * (j + n + 1))
     down = np.sqrt((j + n) * (j - n + 1))
     up2 = up * np.sqrt(np.maximum((j - n - 1) * (j + n + 2), 0.0))
     down2 = down * np.sqrt(np.maximum((j + n - 1) * (j - n + 2), 0.0))
-    rows = np.stack([n, up, down, up2, down2, j * (j + 1) - n**2])
-    out = np.zeros((6, j + 1, width))
+    rows = np.stack([n, up, down, up2, down2])
+    out = np.zeros((5, j + 1, width))
     out[:, :, width // 2 - j : width // 2 + j + 1] = rows[:, None, :]
     return out
 
@@ -313,9 +313,12 @@ def euler_from_matrix(r: NDArray[np.float64]) -> tuple[float, float, float]:
 @numba.njit(cache=True, nogil=True)
 def fill_phases(angle: float, lowest: int, phases: NDArray[np.floating]) -> None:
     """cos(m * angle) and sin(m * angle), m = -lowest, ..., into the rows of `phases`."""
+    # By multiplication: rounding of float64 grows with the order, far below float32's.
+    turn_re, turn_im = np.cos(angle), np.sin(angle)
+    re, im = np.cos(lowest * angle), -np.sin(lowest * angle)
     for k in range(phases.shape[1]):
-        phases[0, k] = np.cos((k - lowest) * angle)
-        phases[1, k] = np.sin((k - lowest) * angle)
+        phases[0, k], phases[1, k] = re, im
+        re, im = re * turn_re - im * turn_im, re * turn_im + im * turn_re
 
 
 @numba.njit(cache=True, nogil=True)

@@ -3,8 +3,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import search
+from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
-from reflfield.alignment.searching import follow, rotation_about
+from reflfield.alignment.searching import rotation_about
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.coupling import couple, rotate_coupled
 from reflfield.sphere.rotations import rotation_angle

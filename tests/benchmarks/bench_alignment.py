@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import search
+from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
-from reflfield.alignment.searching import follow
 from reflfield.sphere.coupling import Coupled, couple, rotate_coupled, uncouple
 from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.sphere.projection import Projector
