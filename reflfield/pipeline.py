@@ -31,30 +31,31 @@ class Stage:
     name : str
     compute : callable
         Writes the results into a folder and returns counts.
-    after : str or None
-        Stage whose results it reads (and through it those before).
+    after : tuple of str
+        Stages whose results it reads (and through them those before), where they are wanted.
     options : callable
         What of the job's options matters.
     reads : callable
         Digests of what it reads besides.
+    wanted : callable
+        Whether the options ask for it.
     """
 
     name: str
     compute: Callable[[Job, Path], Mapping[str, Any]]
-    after: str | None = None
+    after: tuple[str, ...] = ()
     options: Callable[[PipelineOptions], Any] = lambda options: None
     reads: Callable[[Job], Mapping[str, str]] = lambda job: {}
+    wanted: Callable[[PipelineOptions], bool] = lambda options: True
 
     def run(self, job: Job) -> None:
         """Compute the stage, or take its earlier result."""
-        inputs = dict(self.reads(job))
-        if self.after is not None:
-            inputs[self.after] = job.stages.key(self.after)
+        before = [name for name in self.after if BY_NAME[name].wanted(job.options)]
         job.stages.run(
             self.name,
             lambda folder: self.compute(job, folder),
             options=self.options(job.options),
-            inputs=inputs,
+            inputs={**self.reads(job), **{name: job.stages.key(name) for name in before}},
         )
 
 
@@ -69,7 +70,7 @@ ORDER = (
     Stage(
         "hull",
         surface.write_hull,
-        after="silhouettes",
+        after=("silhouettes",),
         options=lambda options: options.hull,
         reads=lambda job: {"lights": job.training.digest(("lights",))},
     ),
@@ -77,57 +78,67 @@ ORDER = (
     Stage(
         "atlas",
         surface.write_atlas,
-        after="hull",
+        after=("hull",),
         options=lambda options: (options.atlas, options.texture),
     ),
     # which camera and which light each texel sees
     Stage(
         "visibility",
         surface.write_visibility,
-        after="atlas",
+        after=("atlas",),
         options=lambda options: options.visibility,
     ),
     # photographs -> apparent BRDF samples per texel
     Stage(
         "observations",
         reflectance.write_observations,
-        after="visibility",
+        after=("visibility",),
         reads=lambda job: {"photographs": job.training.digest(("photographs",))},
     ),
     # scattered directions -> common grid; missing samples filled
     Stage(
         "completion",
         reflectance.write_completion,
-        after="observations",
+        after=("observations",),
         options=lambda options: (options.completion, options.resampling, options.seed),
     ),
     # one local frame per texel
     Stage(
         "alignment",
         reflectance.write_alignment,
-        after="completion",
+        after=("completion",),
         options=lambda options: (options.alignment, options.seed),
     ),
     # raw samples again, in the aligned frames -> clustered local PCA -> field file
     Stage(
         "compression",
         reflectance.write_compression,
-        after="alignment",
+        after=("alignment",),
         options=lambda options: (options.compression, options.seed),
         reads=lambda job: {"name": job.capture.name},
     ),
-    # held-out photographs against the field relit from their cameras
+    # the same in the base frames, to compare with
+    Stage(
+        "without_alignment",
+        reflectance.write_without_alignment,
+        after=("observations",),
+        options=lambda options: (options.compression, options.resampling, options.seed),
+        reads=lambda job: {"name": job.capture.name},
+        wanted=lambda options: options.compares_without_alignment,
+    ),
+    # held-out photographs against the fields relit from their cameras
     Stage(
         "comparison",
         evaluation.write_comparison,
-        after="compression",
+        after=("compression", "without_alignment"),
         options=lambda options: options.relighting,
         reads=lambda job: {n: f.digest() for n, f in evaluation.frame_sets(job).items()},
     ),
     # everything that was found, in one page
-    Stage("report", outputs.write_report_page, after="comparison"),
+    Stage("report", outputs.write_report_page, after=("comparison",)),
 )
 STAGES = tuple(stage.name for stage in ORDER)
+BY_NAME = {stage.name: stage for stage in ORDER}
 
 
 def run(
@@ -187,7 +198,8 @@ def run(
     check_memory(job)
     with only_run(job.stages.root):
         for stage in ORDER[: len(wanted)]:
-            stage.run(job)
+            if stage.wanted(job.options):
+                stage.run(job)
         outputs.publish(job)
     return job
 

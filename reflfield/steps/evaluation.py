@@ -42,19 +42,37 @@ from reflfield.steps.job import Job
 
 # Texels farther from a true surface point than this many texel spacings see another part.
 MATCH_SPACINGS = 2.0
+# Folders of the comparison: of the field itself, and of the one that it is compared with.
+MAIN, WITHOUT = "field", "without_alignment"
 
 
 def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
     """Relight held-out frames and measure them; without any, say so."""
-    field = open_field(job.stages.root / "compression" / "field.rfld")
+    counts: dict[str, Any] = {}
+    for variant, stage in variants(job).items():
+        field = open_field(job.stages.root / stage / "field.rfld")
+        counts |= _compare(job, field, folder / variant, variant)
+    return {"frames": sum(len(f.photographs) for f in frame_sets(job).values()), **counts}
+
+
+def _compare(job: Job, field: ReflectanceField, folder: Path, variant: str) -> dict[str, float]:
+    folder.mkdir(exist_ok=True)
     options = within_memory(job.options.relighting, job.resources)
-    counts: dict[str, Any] = {"frames": 0}
+    counts = {}
     for name, frames in frame_sets(job).items():
         comparison, _ = compare_with_photographs(field, frames, folder / name, options)
         (folder / f"{name}.json").write_text(comparison.to_json())
-        counts["frames"] += len(frames.photographs)
-        counts[f"{name} PSNR, dB"] = comparison.mean["psnr_ldr"]
+        words = f"{name} PSNR, dB" if variant == MAIN else f"{name} PSNR {variant}, dB"
+        counts[words.replace("_", " ")] = comparison.mean["psnr_ldr"]
     return counts
+
+
+def variants(job: Job) -> dict[str, str]:
+    """Stage that makes the field of each variant that is compared."""
+    stages = {MAIN: "compression"}
+    if job.options.compares_without_alignment:
+        stages[WITHOUT] = "without_alignment"
+    return stages
 
 
 # Memory of one ray through a pixel: hits, footprints of up to twelve texels, radiance.
@@ -81,15 +99,15 @@ def frame_sets(job: Job) -> dict[str, Capture]:
     return sets
 
 
-def relit_pairs(job: Job) -> dict[str, RelitPairs]:
+def relit_pairs(job: Job, variant: str = MAIN) -> dict[str, RelitPairs]:
     """What the comparison stage has relit."""
-    root = job.stages.root / "comparison"
+    root = job.stages.root / "comparison" / variant
     return {name: RelitPairs(frames, root / name) for name, frames in frame_sets(job).items()}
 
 
 def stored_comparison(job: Job, name: str) -> dict[str, Any] | None:
     """Metrics that the comparison stage has written."""
-    path = job.stages.root / "comparison" / f"{name}.json"
+    path = job.stages.root / "comparison" / MAIN / f"{name}.json"
     return json.loads(path.read_text()) if path.is_file() else None
 
 
@@ -194,7 +212,7 @@ def completed_samples(
     return (values * cosine[:, None, :, None]).astype(np.float32)
 
 
-def comparison_of(job: Job, name: str) -> Comparison | None:
+def comparison_of(job: Job, name: str, variant: str = MAIN) -> Comparison | None:
     """Metrics of one set, measured again from the stored pictures."""
-    pairs = relit_pairs(job).get(name)
+    pairs = relit_pairs(job, variant).get(name)
     return compare_frames(pairs) if pairs is not None and len(pairs) else None

@@ -114,6 +114,21 @@ class AlignmentOptions:
 
 
 @dataclass(frozen=True)
+class ComparisonOptions:
+    """What the field is compared with, besides photographs.
+
+    Parameters
+    ----------
+    without_alignment : bool
+        Make a second field in the base frames, with as many clusters, components and bits,
+        and report the error of both: what alignment brings. Takes as long again as the
+        compression.
+    """
+
+    without_alignment: bool = False
+
+
+@dataclass(frozen=True)
 class PipelineOptions:
     """Options of all stages; see each dataclass.
 
@@ -132,7 +147,13 @@ class PipelineOptions:
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     compression: CompressionOptions = field(default_factory=CompressionOptions)
     relighting: RenderOptions = field(default_factory=RenderOptions)
+    comparison: ComparisonOptions = field(default_factory=ComparisonOptions)
     seed: int = 0
+
+    @property
+    def compares_without_alignment(self) -> bool:
+        """Whether a second field, in the base frames, is made to compare with."""
+        return self.comparison.without_alignment and self.alignment.enabled
 
     def __post_init__(self) -> None:
         if self.seed < 0:

@@ -31,6 +31,11 @@ from reflfield.steps.standalone import metrics_text
 
 # Texels whose raw samples are averaged together for the mean texture.
 TEXELS_AT_ONCE = 1024
+# Sets of frames that are compared: title and sentence.
+FRAME_TITLES = {
+    "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
+    "truth": ("Unseen views and lights", "Simulated from cameras and lights off the rig."),
+}
 # Memory of one such sample: RGB as half and as float, whether it is observed, twice.
 SAMPLE_BYTES = 24
 
@@ -133,6 +138,7 @@ def report_content(
     main = compared.get("heldout") or compared.get("truth")
     parts = [
         *_frames_sections(job, compared),
+        *_ablation_sections(job, compared),
         *_surface_sections(job, field, average),
         _alignment_section(job),
         *_truth_sections(job, field, compared.get("truth")),
@@ -226,15 +232,36 @@ def _silhouette_views(job: Job) -> Iterator[sections.SilhouetteView]:
 
 
 def _frames_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterator[Section]:
-    titles = {
-        "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
-        "truth": ("Unseen views and lights", "Simulated from cameras and lights off the rig."),
-    }
     for name, pairs in evaluation.relit_pairs(job).items():
         comparison = compared[name]
         if comparison is not None:
-            title, intro = titles[name]
+            title, intro = FRAME_TITLES[name]
             yield sections.frames_section(comparison, pairs, title=title, intro=intro)
+
+
+def _ablation_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterator[Section]:
+    """With alignment against without, if the options ask for it."""
+    if not job.options.compares_without_alignment:
+        return
+    counts = {record.name: record.counts for record in job.stages.records}
+    names = {evaluation.MAIN: "with alignment", evaluation.WITHOUT: "without alignment"}
+    variants, pairs = [], []
+    for variant, stage in evaluation.variants(job).items():
+        found = compared
+        if variant != evaluation.MAIN:
+            found = {n: evaluation.comparison_of(job, n, variant) for n in compared}
+        known = {FRAME_TITLES[n][0]: c for n, c in found.items() if c is not None}
+        variants.append(
+            sections.FieldVariant(
+                names[variant],
+                known,
+                counts[stage]["field bytes"],
+                counts[stage]["relative error of the samples"],
+                counts[stage]["relative error of their cube roots"],
+            )
+        )
+        pairs.append(next(iter(evaluation.relit_pairs(job, variant).values()), ()))
+    yield sections.ablation_section(variants, pairs)
 
 
 def _alignment_section(job: Job) -> Section:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -23,6 +23,7 @@ from reflfield.field.model import (
     ReflectanceField,
     build_field,
 )
+from reflfield.field.residual import sample_error
 from reflfield.observations.projection import project_photographs
 from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot
@@ -31,6 +32,7 @@ from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain, versions
 from reflfield.steps.columns import BlockedColumns, half_columns
 from reflfield.steps.job import Job
+from reflfield.steps.options import AlignmentOptions
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -232,13 +234,29 @@ def _band_limit(wanted: int, directions: NDArray[np.float64]) -> int:
 def write_compression(job: Job, folder: Path) -> dict[str, Any]:
     """Raw samples in the aligned frames -> clusters, mean, basis, coefficients -> field."""
     stored = job.result("alignment", "alignment.npz")
-    frames = local_frames(job, stored["local_from_base"])
+    return write_compressed(job, stored["local_from_base"], plain(job.options), folder)
+
+
+def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
+    """The same in the base frames: as many clusters, components and bits."""
+    frames = np.tile(np.eye(3), (job.base_reader.n_texels, 1, 1))
+    made_with = plain(replace(job.options, alignment=AlignmentOptions(enabled=False)))
+    del made_with["completion"]
+    return write_compressed(job, frames, made_with, folder)
+
+
+def write_compressed(
+    job: Job, local_from_base: NDArray[np.float64], made_with: dict[str, Any], folder: Path
+) -> dict[str, Any]:
+    """Fit a field in the given frames, write it, and measure it on the samples."""
+    frames = local_frames(job, local_from_base)
     model = fitted_model(job, job.base_reader.rotated(frames), folder)
-    made = field_of(job, model, frames)
+    made = field_of(job, model, frames, made_with)
     write_field(folder / "field.rfld", made)
     np.savez(folder / "model.npz", residuals=np.array(model.residuals))
     size = (folder / "field.rfld").stat().st_size
     raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
+    error = sample_error(made, job.base_reader, job.seen_texels)
     return {
         "clusters": made.n_clusters,
         "components": made.n_components,
@@ -246,6 +264,9 @@ def write_compression(job: Job, folder: Path) -> dict[str, Any]:
         "raw bytes": raw,
         "compression ratio": raw / size,
         "residual in the domain": float(model.residuals[-1]) if model.residuals else None,
+        "relative error of the samples": error.linear,
+        "relative error of their cube roots": error.cube_root,
+        "samples measured": error.n_samples,
     }
 
 
@@ -283,7 +304,9 @@ def fitted_model(job: Job, reader: TexelReader, scratch: Path) -> ClusteredModel
     return fill_unobserved(model, job.texels.position, seen)
 
 
-def field_of(job: Job, model: ClusteredModel, frames: Floats) -> ReflectanceField:
+def field_of(
+    job: Job, model: ClusteredModel, frames: Floats, made_with: dict[str, Any]
+) -> ReflectanceField:
     """Quantise the model on the base surface into a field."""
     atlas, texels = job.surface_atlas, job.texels
     surface = BaseSurface(
@@ -306,16 +329,15 @@ def field_of(job: Job, model: ClusteredModel, frames: Floats) -> ReflectanceFiel
         reflectance,
         visibility=job.visibility_kind,  # type: ignore[arg-type]
         light_model="known" if job.training.lights_known else "unknown",
-        metadata=field_metadata(job),
+        metadata=field_metadata(job, made_with),
         quantisation=job.options.compression.quantisation,
     )
 
 
-def field_metadata(job: Job) -> dict[str, Any]:
+def field_metadata(job: Job, made_with: dict[str, Any]) -> dict[str, Any]:
     """What a field says of its making: nothing that a change would not make again."""
-    options = {
-        name: value for name, value in plain(job.options).items() if name != "relighting"
-    }
+    later = ("relighting", "comparison")
+    options = {name: value for name, value in made_with.items() if name not in later}
     return {
         "capture": job.capture.name,
         "up": job.capture.up.tolist(),

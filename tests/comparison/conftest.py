@@ -88,12 +88,12 @@ def full_content(rng, title="vase", prefix="heldout_"):
                 texels, rng.integers(0, 20, n), rng.integers(3, 10, n)
             ),
             sections.normals_section(texels, local, base),
-            sections.alignment_section(
-                [0.80, 0.91, 0.94, 0.945],
-                rng.exponential(0.1, n),
-                {"with alignment": comparison, "without alignment": comparison},
-                file_bytes={"with alignment": 812_000},
+            sections.ablation_section(
+                [sections.FieldVariant("with alignment", {"a": comparison}, 812_000, 0.1, 0.05),
+                 sections.FieldVariant("without", {"a": comparison}, 809_000, 0.2, 0.07)],
+                [pairs, pairs],
             ),
+            sections.alignment_section([0.80, 0.91, 0.94, 0.945], rng.exponential(0.1, n)),
             sections.truth_section(
                 hull=HullDistance(rng.normal(0.001, 0.001, 2000), voxel=0.002),
                 frames=errors[0],

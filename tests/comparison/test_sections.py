@@ -5,7 +5,7 @@ import pytest
 
 from reflfield.comparison import plots, sections
 from reflfield.comparison.metrics import FramePair, compare_frames
-from reflfield.comparison.report import Figure, ReportContent, Table, render_report
+from reflfield.comparison.report import Figure, Note, ReportContent, Table, render_report
 from reflfield.errors import InputError
 
 
@@ -65,6 +65,34 @@ def test_compression_ratio_and_shares():
     section = sections.compression_section({"a": 750, "b": 250}, 8000)
     assert "8 times smaller" in section.intro
     assert tables(section)[0].rows[0] == ("a", "750 B", "75.0 %")
+
+
+def test_fields_of_other_size_are_not_compared_in_silence(rng, samples):
+    pairs = samples.frame_pairs(rng, count=3, size=24)
+    comparison = compare_frames(pairs)
+
+    def section(other_bytes):
+        variants = [
+            sections.FieldVariant("ours", {"held out": comparison}, 1000, 0.1234, 0.05),
+            sections.FieldVariant("other", {"held out": comparison}, other_bytes, 0.2, 0.07),
+        ]
+        return sections.ablation_section(variants, [pairs, pairs])
+
+    equal, unequal = section(1019), section(1021)
+    assert not [item for item in equal.items if isinstance(item, Note)]
+    assert [item.is_warning for item in unequal.items if isinstance(item, Note)] == [True]
+    errors, metrics = tables(equal)
+    assert errors.rows[0][-2:] == ("12.34", "5.00")
+    assert [row[1] for row in metrics.rows] == ["ours", "other"]
+    (strip,) = [item for item in equal.items if isinstance(item, Figure)]
+    assert [panel.label for panel in strip.panels][:3] == ["photograph", "ours", "other"]
+    # All gains are equal: the middle one of three.
+    assert strip.title == "heldout_001"
+
+
+def test_a_comparison_needs_two_fields():
+    with pytest.raises(InputError, match="variants"):
+        sections.ablation_section([], [])
 
 
 def test_turned_frames_show_their_tilt(samples):

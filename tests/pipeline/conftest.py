@@ -65,6 +65,8 @@ rounds = 1
 iterations = 2
 [relighting]
 samples_per_pixel = 1
+[comparison]
+without_alignment = true
 """
 HELD_OUT = ("--hold-out", "views=1,lights=1")
 

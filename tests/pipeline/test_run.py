@@ -119,6 +119,29 @@ class TestWhatARunLeaves:
         assert 'src="http' not in page
         assert "Held-out photographs" in page
 
+    def test_report_sets_alignment_against_none_at_one_size(self, finished):
+        page = (finished.folder / "report" / "index.html").read_text()
+        counts = {
+            stage["name"]: stage["counts"]
+            for stage in json.loads((finished.folder / "timings.json").read_text())["stages"]
+        }
+        ours, other = (counts[name] for name in ("compression", "without_alignment"))
+        assert "With alignment and without" in page
+        for found in (ours, other):
+            assert f"{100 * found['relative error of the samples']:.2f}" in page
+            assert found["clusters"] == ours["clusters"]
+            assert found["components"] == ours["components"]
+            assert abs(found["field bytes"] - ours["field bytes"]) < 0.02 * ours["field bytes"]
+            assert found["samples measured"] == ours["samples measured"] > 1000
+        assert {"heldout PSNR, dB", "heldout PSNR without alignment, dB"} <= set(
+            counts["comparison"]
+        )
+
+    def test_field_without_alignment_has_the_frames_of_the_hull(self, finished):
+        field = open_field(finished.folder / "stages" / "without_alignment" / "field.rfld")
+        # Frames are stored as quantised quaternions.
+        np.testing.assert_allclose(field.local_from_world, field.base_from_world, atol=1e-3)
+
     def test_results_on_stdout_and_only_progress_on_stderr(self, finished):
         assert str(finished.folder / "field.rfld") in finished.outcome.out.splitlines()
         assert "PSNR" in finished.outcome.out
@@ -163,6 +186,19 @@ class TestSecondRun:
         assert [stage for stage, reused in states(run_copy).items() if not reused] == list(
             STAGES[STAGES.index(first) : STAGES.index(last) + 1]
         )
+
+    def test_alignment_does_not_touch_the_field_without_it(self, run_copy, run_tiny):
+        run_tiny(run_copy, "--set", "alignment.iterations=2", "--until", "without_alignment")
+        again = [stage for stage, reused in states(run_copy).items() if not reused]
+        assert again == ["alignment", "compression"]
+
+    def test_without_the_comparison_the_field_is_the_same(self, run_copy, run_tiny, finished):
+        off = ("--set", "comparison.without_alignment=false")
+        assert run_tiny(run_copy, *off, "--from", "compression").status == 0
+        assert "without_alignment" not in states(run_copy)
+        assert digest(run_copy / "field.rfld") == digest(finished.folder / "field.rfld")
+        page = (run_copy / "report" / "index.html").read_text()
+        assert "With alignment and without" not in page
 
     def test_relighting_options_leave_the_field_as_it_would_be_anew(
         self, finished, run_copy, run_tiny

@@ -4,6 +4,7 @@ Every builder returns a `Section`; the pipeline composes them in its order and
 leaves out those whose input a run does not have.
 """
 
+from reflfield.comparison.sections.ablation import FieldVariant, ablation_section
 from reflfield.comparison.sections.frames import (
     alignment_section,
     comparisons_table,
@@ -27,8 +28,10 @@ from reflfield.comparison.sections.surface import (
 from reflfield.comparison.sections.truth import truth_section
 
 __all__ = [
+    "FieldVariant",
     "SilhouetteView",
     "StageRecord",
+    "ablation_section",
     "alignment_section",
     "atlas_section",
     "comparisons_table",

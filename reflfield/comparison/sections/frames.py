@@ -31,7 +31,6 @@ from reflfield.comparison.report import (
     Section,
     Table,
     encode_picture,
-    format_bytes,
 )
 from reflfield.comparison.tonemapping import display
 from reflfield.errors import InputError
@@ -76,12 +75,12 @@ def frames_section(
     """
     shown = {id(f) for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
     rows = [
-        _compared(pair, metrics, comparison.exposure)
+        compared_row(pair, metrics, comparison.exposure)
         for pair, metrics in zip(pairs, comparison.frames, strict=True)
         if id(metrics) in shown
     ]
     rows.sort(key=lambda row: (-row.metrics.flip, row.metrics.name))
-    high = _flip_scale([row.error for row in rows])
+    high = flip_scale([row.error for row in rows])
     items: list[Item] = [_notes_on(comparison)]
     items += [_row_figure(row, high, has_bar=i == 0) for i, row in enumerate(rows)]
     if len(comparison.frames) >= FRAMES_FOR_PLOTS:
@@ -91,14 +90,17 @@ def frames_section(
 
 
 @dataclass(frozen=True, eq=False)
-class _Row:
+class ComparedRow:
+    """One frame for the page: pictures, metrics, and (h, w) FLIP errors."""
+
     metrics: FrameMetrics
     photograph: Picture
     relit: Picture
     error: NDArray[np.float64]
 
 
-def _compared(pair: FramePair, metrics: FrameMetrics, exposure: float) -> _Row:
+def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> ComparedRow:
+    """Crop a frame to the object and find where it differs."""
     if pair.name != metrics.name:
         raise InputError(
             f"pairs: expected frame {metrics.name!r} as in the comparison, received "
@@ -111,24 +113,30 @@ def _compared(pair: FramePair, metrics: FrameMetrics, exposure: float) -> _Row:
     )
     error = flip_map(*(display(image, exposure) for image in without_backdrop(pair)))
     counted = object_pixels(pair.silhouette)
-    return _Row(metrics, photograph, relit, np.where(counted, error, np.nan)[box])
+    return ComparedRow(metrics, photograph, relit, np.where(counted, error, np.nan)[box])
 
 
-def _flip_scale(errors: Sequence[NDArray[np.float64]]) -> float:
+def flip_scale(errors: Sequence[NDArray[np.float64]]) -> float:
+    """End of the colour scale that shows nearly all of the errors."""
     tops = [float(np.nanpercentile(error, 99)) for error in errors]
     top = max(tops, default=1.0)
     return next((scale for scale in FLIP_SCALES if scale >= top), FLIP_SCALES[-1])
 
 
-def _row_figure(row: _Row, high: float, *, has_bar: bool) -> Figure:
-    m = row.metrics
+def error_panel(row: ComparedRow, high: float) -> Picture:
+    """Picture of a row's FLIP error, in false colours from 0 to `high`."""
     coloured = pictures.false_colour(row.error, 0, high, "magma")
     error = pictures.fitted(pictures.with_alpha(coloured, np.isfinite(row.error)), ROW_PX)
+    return encode_picture(error, lossless=True)
+
+
+def _row_figure(row: ComparedRow, high: float, *, has_bar: bool) -> Figure:
+    m = row.metrics
     return Figure(
         (
             Panel(row.photograph, "photograph"),
             Panel(row.relit, "relit"),
-            Panel(encode_picture(error, lossless=True), f"FLIP error, 0 to {high:g}"),
+            Panel(error_panel(row, high), f"FLIP error, 0 to {high:g}"),
         ),
         f"PSNR {m.psnr_ldr:.2f} dB (HDR {m.psnr_hdr:.2f} dB) · SSIM {m.ssim:.3f} · "
         f"FLIP {m.flip:.3f} · {m.n_pixels} object pixels",
@@ -179,9 +187,9 @@ def metrics_table(comparison: Comparison) -> Table:
     Table
     """
     mean = comparison.mean
-    rows = [("mean", *_metric_cells(mean), mean["n_pixels"])]
+    rows = [("mean", *metric_cells(mean), mean["n_pixels"])]
     rows += [
-        (f.name, *_metric_cells(vars(f)), float(f.n_pixels))
+        (f.name, *metric_cells(vars(f)), float(f.n_pixels))
         for f in worst_to_best(comparison.frames)
     ]
     return Table(
@@ -193,7 +201,8 @@ def metrics_table(comparison: Comparison) -> Table:
     )
 
 
-def _metric_cells(metrics: Mapping[str, Any]) -> tuple[str, str, str, str]:
+def metric_cells(metrics: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """Metrics in the order of `METRIC_HEADER`, as text."""
     decimals = (("psnr_ldr", 2), ("psnr_hdr", 2), ("ssim", 4), ("flip", 4))
     red, green, blue, last = (f"{metrics[key]:.{places}f}" for key, places in decimals)
     return red, green, blue, last
@@ -206,14 +215,8 @@ def _even_choice(frames: Sequence[FrameMetrics], count: int) -> list[FrameMetric
     return [frames[rank] for rank in ranks]
 
 
-def alignment_section(
-    history: ArrayLike,
-    margin: ArrayLike,
-    ablation: Mapping[str, Comparison] | None = None,
-    *,
-    file_bytes: Mapping[str, int] | None = None,
-) -> Section:
-    """Alignment: progress of the score, how determined it is, what it brings.
+def alignment_section(history: ArrayLike, margin: ArrayLike) -> Section:
+    """Alignment: progress of the score, how determined it is.
 
     Parameters
     ----------
@@ -221,10 +224,6 @@ def alignment_section(
         Accumulated correlation after each iteration.
     margin : (n_texels,) array_like
         Score gap to the next distinct peak; near 0 is not determined.
-    ablation : mapping of name to Comparison, optional
-        Such as "with alignment", "without alignment", on the same frames.
-    file_bytes : mapping of name to int, optional
-        Size of the field file of each variant.
 
     Returns
     -------
@@ -247,35 +246,23 @@ def alignment_section(
         "orientation of their own (matte or isotropic materials) and keep the hull's.",
         min_width=300,
     )
-    items: list[Item] = [figure]
-    if ablation:
-        items.append(comparisons_table(ablation, file_bytes))
     intro = "One local frame per texel, found by correlating apparent BRDFs over all rotations."
-    return Section("Alignment", intro, tuple(items))
+    return Section("Alignment", intro, (figure,))
 
 
-def comparisons_table(
-    variants: Mapping[str, Comparison], file_bytes: Mapping[str, int] | None = None
-) -> Table:
-    """Mean metrics of variants of one result, on the same frames.
+def comparisons_table(comparisons: Mapping[str, Comparison]) -> Table:
+    """Mean metrics of sets of frames.
 
     Parameters
     ----------
-    variants : mapping of name to Comparison
-    file_bytes : mapping of name to int, optional
+    comparisons : mapping of name to Comparison
 
     Returns
     -------
     Table
     """
-    sizes = file_bytes or {}
-    rows = tuple(
-        (name, *_metric_cells(c.mean), format_bytes(sizes[name]) if name in sizes else None)
-        for name, c in variants.items()
-    )
     return Table(
-        ("variant", *METRIC_HEADER, "size"),
-        rows,
-        "Mean over the held-out frames: higher PSNR and SSIM and lower FLIP are better, at "
-        "equal or smaller size.",
+        ("frames", *METRIC_HEADER),
+        tuple((name, *metric_cells(c.mean)) for name, c in comparisons.items()),
+        "Mean over the frames: higher PSNR and SSIM and lower FLIP are better.",
     )

@@ -1,0 +1,82 @@
+"""Error of a field on samples that are its own values with a known error added."""
+
+import numpy as np
+import pytest
+
+from reflfield.errors import InputError
+from reflfield.field.evaluation import evaluate
+from reflfield.field.residual import sample_error
+from reflfield.field.synthetic import baked_field, blinn_phong, square_surface
+from reflfield.observations.projection import directions_of, pairs_photographed
+from reflfield.observations.reading import TexelReader
+from reflfield.observations.resampling import ResamplingOptions
+from reflfield.observations.store import ObservationStore, Observed, create_samples
+
+from .rigs import dome
+
+
+@pytest.fixture
+def field():
+    return baked_field(square_surface(4, 0.1), blinn_phong(0.3, 0.2, 8.0))
+
+
+@pytest.fixture
+def reader_of(field, tmp_path, rng):
+    """Return a function from a factor on the field's own samples to a reader of them."""
+    capture = dome(5, 6, missing={(1, 2)})
+    n = field.n_texels
+    positions = rng.uniform(-0.05, 0.05, (n, 3)) * [1, 1, 0]
+    views, lights = directions_of(capture, positions)
+    grid = np.indices((n, 5, 6)).reshape(3, -1)
+    own = evaluate(field, grid[0], views[grid[0], grid[1]], lights[grid[0], grid[2]])
+    own = own.reshape(n, 5, 6, 3)
+
+    def make(factor):
+        stored = create_samples(tmp_path / "store", n, 5, 6, 8)
+        seen = Observed(
+            rng.random((n, 5)) < 0.7, rng.random((n, 6)) < 0.7, pairs_photographed(capture)
+        )
+        observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs
+        # What is not observed must not count, whatever it holds.
+        stored[:] = np.where(observed[..., None], factor * own, 1e3).astype(np.float16)
+        return TexelReader(
+            store=ObservationStore(tmp_path / "store", seen),
+            capture=capture,
+            positions=positions,
+            local_from_world=field.base_from_world,
+            sides=(5, 5),
+            options=ResamplingOptions(),
+        )
+
+    return make
+
+
+# Samples are stored as halves: relative error of one, about a third of it after the root.
+HALF = 2.0**-11
+
+
+def test_samples_of_the_field_itself_have_no_error(field, reader_of):
+    found = sample_error(field, reader_of(1.0), np.arange(field.n_texels))
+    assert found.linear < HALF
+    assert found.cube_root < HALF
+
+
+def test_error_is_relative_to_the_samples(field, reader_of):
+    reader = reader_of(2.0)
+    found = sample_error(field, reader, np.arange(field.n_texels))
+    assert found.linear == pytest.approx(0.5, abs=2 * HALF)
+    assert found.cube_root == pytest.approx(1 - 0.5 ** (1 / 3), abs=2 * HALF)
+    assert found.n_samples == reader.store.observed.count()
+
+
+def test_texels_are_thinned_to_the_samples_asked_for(field, reader_of):
+    reader = reader_of(2.0)
+    each = reader.store.observed.count() / field.n_texels
+    found = sample_error(field, reader, np.arange(field.n_texels), int(4.5 * each))
+    assert found.n_texels == 4
+    assert found.linear == pytest.approx(0.5, abs=2 * HALF)
+
+
+def test_no_texel_is_refused(field, reader_of):
+    with pytest.raises(InputError, match="texels"):
+        sample_error(field, reader_of(1.0), np.zeros(0, int))
