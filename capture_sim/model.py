@@ -79,12 +79,14 @@ class Brightness:
     Attributes
     ----------
     percentile99 : float
-        The darkest photograph's 99th percentile of its values that are not
-        black. Where nobody has measured it, that of a white surface that
+        Lower bound on a photograph's 99th percentile of its values that are
+        not black. Where nobody has measured it, that of a white surface that
         faces a light of the default irradiance.
     headroom : float
-        Largest ratio of a photograph's brightest value to its 99th
+        Upper bound on the ratio of a photograph's brightest value to its 99th
         percentile; above 1 for highlights.
+    brightest : float
+        Upper bound on all values.
     noise : float
         Standard deviation of the sensor in the dark, as a part of the
         brightest photograph's 99th percentile.
@@ -92,6 +94,7 @@ class Brightness:
 
     percentile99: float = 1.0
     headroom: float = 1.0
+    brightest: float = 1.0
     noise: float = 0.0
 
 

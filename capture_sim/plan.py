@@ -15,15 +15,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from capture_sim.brightness import measured, spread
 from capture_sim.effects import Cost, Effect, Workload, simulated
-from capture_sim.effects.registry import EFFECTS, decided
+from capture_sim.effects.registry import EFFECTS
 from capture_sim.files import write_exr
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
 from capture_sim.render import ViewSamples, arriving_light, sample_view, shade
 from capture_sim.truth import write_view_truth
 
-# Enough to average over near and far sides of the object, few enough to take no time.
+# Timed in earnest: enough to average over the sides of the object.
 TRIAL_VIEWS = 3
 TRIAL_LIGHTS = 6
 
@@ -121,8 +122,8 @@ def plan(scene: Scene) -> Plan:
     Plan
         Its times depend on how busy the machine is.
     """
-    scene = decided(scene)
     tracer = RayTracer(scene.mesh)
+    scene = measured(scene, tracer)
     trial = _run_trial(scene, tracer)
     n_views, n_lights = len(scene.cameras), len(scene.lights)
     points = trial.points_per_view * n_views
@@ -164,10 +165,10 @@ class _Trial:
 
 
 def _run_trial(scene: Scene, tracer: RayTracer) -> _Trial:
-    cameras = _spread(len(scene.cameras), TRIAL_VIEWS)
-    lights = tuple(scene.lights[i] for i in _spread(len(scene.lights), TRIAL_LIGHTS))
-    measured = [_one_view(scene, tracer, camera, lights) for camera in cameras]
-    return _Trial(*(float(column) for column in np.mean(measured, axis=0)))
+    cameras = spread(len(scene.cameras), TRIAL_VIEWS)
+    lights = tuple(scene.lights[i] for i in spread(len(scene.lights), TRIAL_LIGHTS))
+    columns = [_one_view(scene, tracer, camera, lights) for camera in cameras]
+    return _Trial(*(float(column) for column in np.mean(columns, axis=0)))
 
 
 def _one_view(
@@ -205,11 +206,6 @@ def _lit_fraction(scene: Scene, view: ViewSamples, lights: tuple[Table, ...]) ->
     directions = arriving_light(scene, lights, points.position).directions
     cosine = np.einsum("nlj,nj->nl", directions, points.shading_from_world[:, 2])
     return float((cosine > 0.0).mean())
-
-
-def _spread(count: int, wanted: int) -> list[int]:
-    """Up to `wanted` indices spread over ``range(count)``."""
-    return sorted({int(i) for i in np.linspace(0, count - 1, min(wanted, count))})
 
 
 def _timed(work: Callable[[], Result]) -> tuple[Result, float]:

@@ -94,7 +94,7 @@ def _undistorted(camera: CameraDict, plane: Array) -> Array:
     """Remove the lens distortion from normalised image coordinates (n, 2)."""
     # With eight terms OpenCV's k4 is the first of the denominator, as in the capture format.
     terms = np.array([camera.get(key, 0.0) for key in _LENS_TERMS] + [0.0, 0.0])
-    if not terms.any():
+    if not terms.any() or len(plane) == 0:
         return plane
     straight = cv2.undistortPoints(
         plane[:, None], np.eye(3), terms, None, None, None, criteria=_UNDISTORT

@@ -37,16 +37,20 @@ Table = Mapping[str, Any]
 Arrays = dict[str, NDArray[Any]]
 
 
-def write_truth(scene: Scene, tracer: RayTracer, folder: Path) -> None:
+def write_truth(scene: Scene, tracer: RayTracer, folder: Path, *, ideal: Scene) -> None:
     """Write all truth that is not per view, and the list of what there is.
 
     Parameters
     ----------
     scene : Scene
+        With cameras and lights as they are.
     tracer : RayTracer
         Of the scene's mesh.
     folder : Path
         The capture; ``truth/`` is made inside.
+    ideal : Scene
+        With cameras and lights as calibrated: held-out frames are free of the rig's
+        errors, of the lens' and of the sensor's.
     """
     truth = folder / "truth"
     truth.mkdir(exist_ok=True)
@@ -54,9 +58,9 @@ def write_truth(scene: Scene, tracer: RayTracer, folder: Path) -> None:
     write_ply(truth / "mesh.ply", scene.mesh)
     if scene.truth.per_view:
         listing["views"] = "truth/views/{camera}.npz"
-    if scene.heldout_frames:
+    if ideal.heldout_frames:
         listing["heldout"] = "truth/heldout.json"
-        _write_heldout(scene, tracer, truth)
+        _write_heldout(ideal, tracer, truth)
     if scene.truth.points:
         listing["abrdf"] = "truth/abrdf.npz"
         write_npz(truth / "abrdf.npz", apparent_brdfs(scene, tracer))

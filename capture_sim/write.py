@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capture_sim.brightness import measured
 from capture_sim.effects import Frame, exposure_brackets, simulated
-from capture_sim.effects.registry import decided
 from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
 from capture_sim.files import write_exr, write_json, write_png, write_silhouette
 from capture_sim.model import Scene
+from capture_sim.photograph import Setup, photographs, set_up
 from capture_sim.rays import RayTracer
-from capture_sim.render import render_view, sample_view
+from capture_sim.render import sample_view
 from capture_sim.truth import write_truth, write_view_truth
 
 Table = Mapping[str, Any]
@@ -73,7 +74,7 @@ def write_capture(
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
-        _fill(decided(scene), part, workers, progress or (lambda done, total: None))
+        _fill(scene, part, workers, progress or (lambda done, total: None))
         _move_into_place(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -127,13 +128,14 @@ def _move_into_place(part: Path, folder: Path) -> None:
 
 def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
     tracer = RayTracer(scene.mesh, n_threads=1 if workers > 1 else 0)
+    setup = set_up(measured(scene, tracer))
     for name in ("photographs", "silhouettes"):
         (folder / name).mkdir()
     steps = len(scene.cameras) + 1
     progress(0, steps)
     with ThreadPoolExecutor(workers) as pool:
         views = range(len(scene.cameras))
-        futures = [pool.submit(_write_view, scene, tracer, view, folder) for view in views]
+        futures = [pool.submit(_write_view, setup, tracer, view, folder) for view in views]
         try:
             for done, future in enumerate(as_completed(futures), start=1):
                 future.result()
@@ -141,17 +143,19 @@ def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    write_truth(scene, tracer, folder)
-    write_json(folder / CAPTURE_FILE, capture_description(scene))
+    write_truth(setup.real, tracer, folder, ideal=setup.reported)
+    write_json(folder / CAPTURE_FILE, capture_description(setup))
     progress(steps, steps)
 
 
-def _write_view(scene: Scene, tracer: RayTracer, index: int, folder: Path) -> None:
+def _write_view(setup: Setup, tracer: RayTracer, index: int, folder: Path) -> None:
+    scene = setup.real
     camera = scene.cameras[index]
     view = sample_view(scene, tracer, camera)
     write_silhouette(folder / _silhouette(camera), view.coverage)
-    for light, radiance in render_view(scene, tracer, view):
-        _write_photograph(scene, folder, Frame(camera, index, light), radiance)
+    lights = np.flatnonzero(setup.rig.taken[index])
+    for frame, radiance in photographs(scene, tracer, index, lights, view):
+        _write_photograph(scene, folder, frame, radiance)
     if scene.truth.per_view:
         write_view_truth(scene, tracer, camera, folder)
 
@@ -187,41 +191,45 @@ def _silhouette(camera: Table) -> str:
     return f"silhouettes/{camera['id']}.png"
 
 
-def capture_description(scene: Scene) -> dict[str, Any]:
+def capture_description(setup: Setup) -> dict[str, Any]:
     """Contents of `capture.json`.
 
     Parameters
     ----------
-    scene : Scene
-        What was simulated.
+    setup : Setup
+        What was simulated; its calibration is reported.
 
     Returns
     -------
     dict
         Of JSON types, in the order in which it is written.
     """
+    scene, rig = setup.scene, setup.rig
     return {
         "format": "reflfield-capture",
         "version": 1,
         "name": scene.name,
         "generator": GENERATOR,
         "base_geometry": scene.base_geometry,
-        "cameras": [{**camera, "silhouette": _silhouette(camera)} for camera in scene.cameras],
-        "lights": [dict(light) for light in scene.lights],
-        "photographs": _photograph_list(scene),
+        "cameras": [{**c, "silhouette": _silhouette(c)} for c in rig.reported_cameras],
+        "lights": [dict(light) for light in rig.reported_lights],
+        "photographs": _photograph_list(setup),
         "truth": "truth/truth.json",
     }
 
 
-def _photograph_list(scene: Scene) -> dict[str, str] | list[dict[str, Any]]:
-    if not simulated(scene, exposure_brackets):
+def _photograph_list(setup: Setup) -> dict[str, str] | list[dict[str, Any]]:
+    bracketed = simulated(setup.scene, exposure_brackets)
+    if setup.rig.taken.all() and not bracketed:
         return {"pattern": _photograph("{camera}", "{light}")}
     return [
-        {
-            "camera": camera["id"],
-            "light": light["id"],
-            "exposures": _exposures(scene, camera, light),
-        }
-        for camera in scene.cameras
-        for light in scene.lights
+        _listed(setup.scene, setup.scene.cameras[view], setup.scene.lights[light], bracketed)
+        for view, light in np.argwhere(setup.rig.taken).tolist()
     ]
+
+
+def _listed(scene: Scene, camera: Table, light: Table, bracketed: bool) -> dict[str, Any]:
+    names = {"camera": camera["id"], "light": light["id"]}
+    if bracketed:
+        return {**names, "exposures": _exposures(scene, camera, light)}
+    return {**names, "file": _photograph(camera["id"], light["id"])}

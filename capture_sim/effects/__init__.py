@@ -22,7 +22,7 @@ Stages, in the order in which they act, and what ``apply`` gets and returns ther
 ``TRANSPORT``  ``apply(scene, tracer, points, views, lights) -> (n, n_lights, 3)``:
                radiance that surface points send to the camera beyond direct light
 ``OPTICS``     ``apply(radiance, scene, frame) -> radiance``: from the radiance of the
-               scene to what arrives at the pixels
+               scene to what arrives at the pixels, (h, w, 3) float32
 ``SENSOR``     ``apply(values, scene, frame) -> values``: from what arrives to what is
                recorded
 =============  =======================================================================
@@ -39,6 +39,7 @@ from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capture_sim.model import Scene, Table
 
@@ -130,6 +131,9 @@ class Frame:
         Index among the exposures of the photograph.
     seconds : float
         Exposure time; 1 for photographs that are not bracketed.
+    depth : (h, w) float32, optional
+        Mean distance of what a pixel shows along the optical axis, metres; 0 where
+        it shows nothing. Given where the lens blurs.
     """
 
     camera: Table
@@ -137,11 +141,51 @@ class Frame:
     light: int
     exposure: int = 0
     seconds: float = 1.0
+    depth: NDArray[np.float32] | None = None
 
     def rng(self, scene: Scene, effect: str) -> np.random.Generator:
         """Generator of this photograph and effect: results depend on no order of work."""
-        name = zlib.crc32(effect.encode())
-        return np.random.default_rng((scene.seed, self.view, self.light, self.exposure, name))
+        return effect_rng(scene, effect, self.view, self.light, self.exposure)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras and lights as they are, and as the capture says they are.
+
+    Attributes
+    ----------
+    cameras, lights : tuple of dict
+        As they are: photographs are rendered with these.
+    reported_cameras, reported_lights : tuple of dict
+        Calibration that is written into the capture.
+    taken : (n_views, n_lights) bool
+        True for photographs that exist.
+    """
+
+    cameras: tuple[Table, ...]
+    lights: tuple[Table, ...]
+    reported_cameras: tuple[Table, ...]
+    reported_lights: tuple[Table, ...]
+    taken: NDArray[np.bool_]
+
+
+def effect_rng(scene: Scene, effect: str, *indices: int) -> np.random.Generator:
+    """Random numbers of one effect, the same whatever other effects are on.
+
+    Parameters
+    ----------
+    scene : Scene
+        Gives the seed.
+    effect : str
+        Its name.
+    *indices : int
+        Of view, light, exposure, where each has numbers of its own.
+
+    Returns
+    -------
+    numpy.random.Generator
+    """
+    return np.random.default_rng((scene.seed, *indices, zlib.crc32(effect.encode())))
 
 
 class Effect(Protocol):

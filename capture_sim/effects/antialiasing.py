@@ -25,7 +25,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound what a single ray per pixel changes: an outline turns a pixel on or off.
+    """Tell whether pixels have several rays; there is no bound on what one ray meets.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def needed(scene: Scene) -> Decision:
     if max(inside, edge) == 1:
         return Decision("one ray per pixel was asked for", 0.0)
     reason = f"{inside} x {inside} rays inside the object, {edge} x {edge} at outlines"
-    return Decision(reason, scene.brightness.headroom)
+    return Decision(reason, float("inf"))
 
 
 def cost(scene: Scene, work: Workload) -> Cost:

@@ -86,3 +86,28 @@ def apply(exposed: NDArray[np.float32]) -> NDArray[np.uint8]:
     power = 1.055 * linear ** (1.0 / 2.4) - 0.055
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, power)
     return np.rint(255.0 * encoded).astype(np.uint8)
+
+
+def best_exposure(radiance: NDArray[np.float32], scene: Scene) -> NDArray[np.float32]:
+    """Radiance as the longest exposure that does not saturate a pixel holds it.
+
+    Parameters
+    ----------
+    radiance : (h, w, 3) float32
+        Linear.
+    scene : Scene
+        Gives the exposure times.
+
+    Returns
+    -------
+    (h, w, 3) float32
+        What any merge of the exposures can know, up to rounding.
+    """
+    best = np.zeros_like(radiance)
+    for seconds in sorted(scene.effects.get(Options).seconds):
+        encoded = apply(radiance * np.float32(seconds)) / 255.0
+        power = ((encoded + 0.055) / 1.055) ** 2.4
+        linear = np.where(encoded <= 0.04045, encoded / 12.92, power) / seconds
+        replaced = (encoded < 1.0) | (best == 0.0)
+        best = np.where(replaced, linear, best).astype(np.float32)
+    return best

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.effects import Cost, Decision, Stage, Workload
+from capture_sim.effects.bounds import steepness
 from capture_sim.errors import SceneError
 from capture_sim.model import Scene
 
@@ -36,8 +37,8 @@ def needed(scene: Scene) -> Decision:
     r"""Bound the change of irradiance and direction over the object.
 
     For a light at distance `d` of the centre of an object of radius `r`, the
-    irradiance varies by up to :math:`1 - (1 + r/d)^{-2}` to
-    :math:`(1 - r/d)^{-2} - 1`, and more where direction and shadow change with it.
+    irradiance varies by up to :math:`(1 - r/d)^{-2} - 1`; the direction turns by up
+    to :math:`r/d`, and radiance follows with the steepness of the material.
 
     Parameters
     ----------
@@ -55,7 +56,9 @@ def needed(scene: Scene) -> Decision:
     distance = np.linalg.norm(positions - scene.mesh.centre, axis=1).min()
     ratio = scene.mesh.radius / distance
     reason = f"{len(near)} of {len(scene.lights)} lights stand {distance:.3g} m away or more"
-    change = (1.0 - ratio) ** -2 - 1.0 if ratio < 1.0 else np.inf
+    if ratio >= 1.0:
+        return Decision(reason, np.inf)
+    change = (1.0 - ratio) ** -2 - 1.0 + min(1.0, ratio * steepness(scene.material))
     return Decision(reason, float(scene.brightness.headroom * change))
 
 

@@ -7,23 +7,53 @@ from dataclasses import replace
 from capture_sim.effects import (
     Effect,
     antialiasing,
+    bayer,
+    black_level,
+    defocus,
+    dropped_photographs,
+    environment,
     exposure_brackets,
+    falloff_profile,
     interreflection,
+    lens_distortion,
+    light_extent,
+    light_position_error,
+    light_variation,
+    misregistration,
     near_lights,
+    pose_error,
+    quantisation,
+    saturation,
     sensor_noise,
     shadows,
     simulated,
+    vignetting,
 )
 from capture_sim.errors import scene_error
 from capture_sim.model import EffectOptions, Scene
 from capture_sim.tables import Table, TableReader, read_options
 
 EFFECTS: tuple[Effect, ...] = (
+    lens_distortion,
+    pose_error,
+    misregistration,
+    falloff_profile,
+    light_position_error,
+    light_variation,
+    dropped_photographs,
     antialiasing,
     near_lights,
     shadows,
+    light_extent,
+    environment,
     interreflection,
+    vignetting,
+    defocus,
+    bayer,
     sensor_noise,
+    saturation,
+    black_level,
+    quantisation,
     exposure_brackets,
 )
 

@@ -5,10 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Frame, sensor_noise, simulated
+from capture_sim.effects import (
+    Frame,
+    bayer,
+    black_level,
+    quantisation,
+    saturation,
+    sensor_noise,
+    simulated,
+)
 from capture_sim.model import Scene
 
 Float32 = NDArray[np.float32]
+
+# In the order in which a sensor does them: photons, full wells, pedestal, digitising.
+PIXEL_EFFECTS = (sensor_noise, saturation, black_level, quantisation)
 
 
 def exposed(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
@@ -29,6 +40,38 @@ def exposed(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
         Linear; radiance times the exposure's seconds, with the sensor's errors.
     """
     values = radiance if frame.seconds == 1.0 else radiance * np.float32(frame.seconds)
-    if simulated(scene, sensor_noise):
-        values = sensor_noise.apply(values, scene, frame)
+    if not simulated(scene, bayer):
+        return _recorded(scene, values, frame)
+    with scene.costs.measure(bayer.NAME):
+        seen = bayer.mosaic(values)
+    seen = _recorded(scene, seen, frame)
+    with scene.costs.measure(bayer.NAME):
+        return bayer.apply(seen, scene)
+
+
+def _recorded(scene: Scene, values: Float32, frame: Frame) -> Float32:
+    for effect in PIXEL_EFFECTS:
+        if simulated(scene, effect):
+            with scene.costs.measure(effect.NAME):
+                values = effect.apply(values, scene, frame)
     return values
+
+
+def dark_noise(scene: Scene) -> float:
+    """Standard deviation of what the sensor records in the dark, in units of radiance.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    float
+        Read noise and rounding, as far as the scene describes them.
+    """
+    read = scene.effects.declared(sensor_noise.Options)
+    digits = scene.effects.declared(quantisation.Options)
+    variance = 0.0 if read is None else sensor_noise.standard_deviation(read, 0.0) ** 2
+    if digits is not None:
+        variance += digits.step**2 / 12.0
+    return float(np.sqrt(variance))

@@ -114,9 +114,7 @@ def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np
     EMVA Standard 1288, "Standard for characterization of image sensors and
     cameras", release 4.0, 2021: shot noise is Poisson, dark noise normal.
     """
-    options = scene.effects.get(Options)
-    with scene.costs.measure(NAME):
-        return with_noise(values, options, frame.rng(scene, NAME))
+    return with_noise(values, scene.effects.get(Options), frame.rng(scene, NAME))
 
 
 def with_noise(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,12 +53,12 @@ class SurfaceMesh:
     has_uv: bool = True
     name: str = "object"
 
-    @property
+    @cached_property
     def centre(self) -> Array:
         """Centre of the bounding box, (3,) float64."""
         return np.asarray((self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2.0)
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Radius of the sphere about `centre` that holds the object, metres."""
         return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())

@@ -62,7 +62,7 @@ def test_effects_can_be_forced(mode, traced):
         ("none", set()),
         (["shadows"], {"shadows"}),
         ({"simulate": "none", "near_lights": "on"}, {"near_lights"}),
-        ({"simulate": "auto", "tolerance": 1.0}, {"near_lights"}),
+        ({"simulate": "auto", "tolerance": 1.0}, {"antialiasing", "near_lights"}),
     ],
 )
 def test_the_choice_decides(choice, expected):

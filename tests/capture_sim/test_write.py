@@ -156,7 +156,7 @@ def test_other_folders_and_files_are_never_replaced(tmp_path):
 
 
 def test_failure_leaves_nothing_behind(tmp_path, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise OSError("disk full")
 
     monkeypatch.setattr(capture_sim.write, "write_truth", fail)

@@ -1,0 +1,87 @@
+r"""Values that are whole steps of a digitiser, :math:`\Delta = L_\mathrm{full} / (2^b - 1)`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture_sim.effects import Cost, Decision, Frame, Stage, Workload
+from capture_sim.model import Scene
+from capture_sim.tables import bounded
+
+NAME = "quantisation"
+STAGE = Stage.SENSOR
+
+
+@dataclass(frozen=True)
+class Options:
+    """The digitiser.
+
+    Attributes
+    ----------
+    bits : int
+        Of each value.
+    full_scale : float
+        Radiance (times 1 s of exposure) of the largest code.
+    """
+
+    bits: int = bounded(12, low=1, high=24)
+    full_scale: float = bounded(4.0, low=1e-12)
+
+    @property
+    def step(self) -> float:
+        """Radiance of one step.
+
+        Examples
+        --------
+        >>> Options(bits=8, full_scale=255.0).step
+        1.0
+        """
+        return self.full_scale / (2**self.bits - 1)
+
+
+def needed(scene: Scene) -> Decision:
+    """Bound the change by half a step.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    Decision
+    """
+    options = scene.effects.declared(Options)
+    if options is None:
+        return Decision("values are continuous: no [effects.quantisation]", 0.0)
+    reason = f"{options.bits} bits up to {options.full_scale:g}: steps of {options.step:.2g}"
+    return Decision(reason, 0.5 * options.step / scene.brightness.percentile99)
+
+
+def cost(scene: Scene, work: Workload) -> Cost:
+    """One rounding for each channel of each pixel."""
+    del scene
+    return Cost(operations=3 * work.n_pixels * work.n_lights)
+
+
+def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
+    """Round to whole steps.
+
+    Parameters
+    ----------
+    values : (...) float32
+        Linear.
+    scene : Scene
+        Gives the digitiser.
+    frame : Frame
+        Not used: all photographs are alike.
+
+    Returns
+    -------
+    (...) float32
+    """
+    del frame
+    step = np.float32(scene.effects.get(Options).step)
+    return np.rint(values / step) * step

@@ -1,0 +1,180 @@
+"""One view's photographs through all stages that its effects act at.
+
+Rays and shading come from `render`; here the room's light, lamps with an area, the lens
+and the sensor are put around them, each only where it is on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from capture_sim.effects import (
+    Effect,
+    Frame,
+    Rig,
+    defocus,
+    environment,
+    light_extent,
+    simulated,
+    vignetting,
+)
+from capture_sim.effects.rig import real_rig
+from capture_sim.model import Scene
+from capture_sim.rays import RayTracer
+from capture_sim.render import ViewSamples, render_view, sample_view, shade
+
+Float32 = NDArray[np.float32]
+
+OPTICS_EFFECTS = (defocus, vignetting)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A scene, and what stands in the dome in truth.
+
+    Attributes
+    ----------
+    scene : Scene
+        Cameras and lights as calibrated.
+    rig : Rig
+        What the effects of the rig made of them.
+    """
+
+    scene: Scene
+    rig: Rig
+
+    @property
+    def real(self) -> Scene:
+        """The scene with cameras and lights as they are: what is rendered."""
+        return replace(
+            self.scene, cameras=self.rig.cameras, lights=self.rig.lights, heldout_frames=0
+        )
+
+    @property
+    def reported(self) -> Scene:
+        """The scene with cameras as the capture reports them and ideal lights."""
+        return replace(self.scene, cameras=self.rig.reported_cameras)
+
+
+def set_up(scene: Scene) -> Setup:
+    """Put cameras and lights where they really are.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    Setup
+    """
+    return Setup(scene, real_rig(scene))
+
+
+def photographs(
+    scene: Scene,
+    tracer: RayTracer,
+    index: int,
+    lights: NDArray[np.intp],
+    view: ViewSamples | None = None,
+) -> Iterator[tuple[Frame, Float32]]:
+    """Photographs of one view, up to the sensor.
+
+    Parameters
+    ----------
+    scene : Scene
+        The real one.
+    tracer : RayTracer
+        Of the scene's mesh.
+    index : int
+        Of the view.
+    lights : (n,) int
+        Indices of the lights wanted; in ascending order.
+    view : ViewSamples, optional
+        Of the view's camera, if the caller has it already.
+
+    Yields
+    ------
+    frame : Frame
+    radiance : (h, w, 3) float32
+        Linear, arriving at the pixels.
+    """
+    view = view or sample_view(scene, tracer, scene.cameras[index])
+    room = _room_light(scene, tracer, view) if simulated(scene, environment) else None
+    depth = mean_depth(view) if simulated(scene, defocus) else None
+    for light, radiance in _lit_by_lamps(scene, tracer, view, lights):
+        frame = Frame(view.camera, index, light, depth=depth)
+        arriving = radiance if room is None else radiance + room
+        yield frame, _through_lens(scene, arriving, frame)
+
+
+def _lit_by_lamps(
+    scene: Scene, tracer: RayTracer, view: ViewSamples, lights: NDArray[np.intp]
+) -> Iterator[tuple[int, Float32]]:
+    if len(lights) == 0:
+        return
+    if simulated(scene, light_extent):
+        for light in lights.tolist():
+            yield light, _lit_by_area(scene, tracer, view, light)
+        return
+    wanted = replace(scene, lights=tuple(scene.lights[light] for light in lights))
+    for place, radiance in render_view(wanted, tracer, view):
+        yield int(lights[place]), radiance
+
+
+def _lit_by_area(scene: Scene, tracer: RayTracer, view: ViewSamples, light: int) -> Float32:
+    with scene.costs.measure(light_extent.NAME):
+        patches = light_extent.apply(scene, scene.lights[light])
+        return np.asarray(shade(scene, tracer, view, patches).sum(axis=0))
+
+
+def _room_light(scene: Scene, tracer: RayTracer, view: ViewSamples) -> Float32:
+    with scene.costs.measure(environment.NAME):
+        return np.asarray(shade(scene, tracer, view, environment.apply(scene)).sum(axis=0))
+
+
+def _through_lens(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
+    for effect in OPTICS_EFFECTS:
+        if simulated(scene, effect):
+            with scene.costs.measure(effect.NAME):
+                radiance = effect.apply(radiance, scene, frame)
+    return radiance
+
+
+def mean_depth(view: ViewSamples) -> Float32:
+    """Mean distance along the optical axis of what each pixel shows.
+
+    Parameters
+    ----------
+    view : ViewSamples
+
+    Returns
+    -------
+    (h, w) float32
+        Metres; 0 where the pixel shows nothing.
+    """
+    pose = np.asarray(view.camera["camera_from_world"], np.float64)
+    depth = view.points.position @ pose[2, :3] + pose[2, 3]
+    total = view.pixel_from_point @ np.stack([depth, np.ones_like(depth)], axis=1)
+    mean = total[:, 0] / np.where(total[:, 1] > 0.0, total[:, 1], 1.0)
+    return np.asarray(mean.reshape(view.coverage.shape), np.float32)
+
+
+def without(scene: Scene, effect: Effect) -> Scene:
+    """A scene whose effects were decided, with one of them left out.
+
+    Parameters
+    ----------
+    scene : Scene
+        From `capture_sim.effects.registry.decided`.
+    effect : module
+
+    Returns
+    -------
+    Scene
+    """
+    active = (scene.effects.active or frozenset()) - {effect.NAME}
+    return replace(scene, effects=replace(scene.effects, active=active))
