@@ -26,6 +26,7 @@ from capture_sim.effects.rig import real_rig
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
 from capture_sim.render import ViewSamples, render_view, sample_view, shade
+from capture_sim.visibility import TracedLights
 
 Float32 = NDArray[np.float32]
 
@@ -80,6 +81,7 @@ def photographs(
     index: int,
     lights: NDArray[np.intp],
     view: ViewSamples | None = None,
+    traced: TracedLights | None = None,
 ) -> Iterator[tuple[Frame, Float32]]:
     """Photographs of one view, up to the sensor.
 
@@ -95,6 +97,8 @@ def photographs(
         Indices of the lights wanted; in ascending order.
     view : ViewSamples, optional
         Of the view's camera, if the caller has it already.
+    traced : TracedLights, optional
+        Visibility of the scene's lights, if the caller has it already.
 
     Yields
     ------
@@ -105,14 +109,18 @@ def photographs(
     view = view or sample_view(scene, tracer, scene.cameras[index])
     room = _room_light(scene, tracer, view) if simulated(scene, environment) else None
     depth = mean_depth(view) if simulated(scene, defocus) else None
-    for light, radiance in _lit_by_lamps(scene, tracer, view, lights):
+    for light, radiance in _lit_by_lamps(scene, tracer, view, lights, traced):
         frame = Frame(view.camera, index, light, depth=depth)
         arriving = radiance if room is None else radiance + room
         yield frame, _through_lens(scene, arriving, frame)
 
 
 def _lit_by_lamps(
-    scene: Scene, tracer: RayTracer, view: ViewSamples, lights: NDArray[np.intp]
+    scene: Scene,
+    tracer: RayTracer,
+    view: ViewSamples,
+    lights: NDArray[np.intp],
+    traced: TracedLights | None,
 ) -> Iterator[tuple[int, Float32]]:
     if len(lights) == 0:
         return
@@ -121,7 +129,8 @@ def _lit_by_lamps(
             yield light, _lit_by_area(scene, tracer, view, light)
         return
     wanted = replace(scene, lights=tuple(scene.lights[light] for light in lights))
-    for place, radiance in render_view(wanted, tracer, view):
+    known = None if traced is None else traced.some(lights)
+    for place, radiance in render_view(wanted, tracer, view, known):
         yield int(lights[place]), radiance
 
 
@@ -158,8 +167,9 @@ def mean_depth(view: ViewSamples) -> Float32:
     """
     pose = np.asarray(view.camera["camera_from_world"], np.float64)
     depth = view.points.position @ pose[2, :3] + pose[2, 3]
-    total = view.pixel_from_point @ np.stack([depth, np.ones_like(depth)], axis=1)
-    mean = total[:, 0] / np.where(total[:, 1] > 0.0, total[:, 1], 1.0)
+    total = np.bincount(view.pixel, view.weight * depth, minlength=view.coverage.size)
+    covered = np.bincount(view.pixel, view.weight, minlength=view.coverage.size)
+    mean = total / np.where(covered > 0.0, covered, 1.0)
     return np.asarray(mean.reshape(view.coverage.shape), np.float32)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
@@ -80,14 +81,25 @@ def camera_rays(camera: CameraDict, pixels: Array) -> tuple[Array, Array]:
     focal = np.array([camera["fl_x"], camera["fl_y"]], dtype=np.float64)
     plane = _undistorted(camera, (pixels - [camera["cx"], camera["cy"]]) / focal)
     world = world_from_camera(camera)
-    ones = np.ones((len(plane), 1))
-    if camera["model"] == "orthographic":
-        local = np.hstack([plane, 0.0 * ones])
-        directions = np.broadcast_to(world[:3, 2], local.shape).copy()
-        return local @ world[:3, :3].T + world[:3, 3], directions
-    directions = np.hstack([plane, ones]) @ world[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.broadcast_to(world[:3, 3], directions.shape).copy(), directions
+    origins, directions = np.zeros((2, len(plane), 3))
+    parallel = camera["model"] == "orthographic"
+    _fill_rays(plane, np.ascontiguousarray(world[:3]), parallel, origins, directions)
+    return origins, directions
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_rays(
+    plane: Array, world: Array, parallel: bool, origins: Array, directions: Array
+) -> None:
+    """Rays through points (n, 2) of the plane z = 1, carried into the world."""
+    for n in range(len(plane)):
+        x, y = plane[n, 0], plane[n, 1]
+        slanted = 0.0 if parallel else 1.0
+        length = np.sqrt(slanted * (x * x + y * y) + 1.0)
+        for c in range(3):
+            across = world[c, 0] * x + world[c, 1] * y
+            directions[n, c] = (slanted * across + world[c, 2]) / length
+            origins[n, c] = world[c, 3] + (1.0 - slanted) * across
 
 
 def _undistorted(camera: CameraDict, plane: Array) -> Array:

@@ -6,24 +6,34 @@ The value of a pixel is the mean over its rays of
 
 with the BRDF `f` and the normal of the shading frame, `E` the irradiance of a
 surface that faces the light and `V` 1 where nothing hides the light. Rays from
-the camera are traced once per view and shared by all lights.
+the camera are traced once per view and shared by all lights, shadow rays once per
+light and shared by all views where that is exact enough (`capture_sim.visibility`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import reduce
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.ndimage import maximum_filter, minimum_filter
 
+from capture_sim.arrival import LightArrays
 from capture_sim.effects import antialiasing, near_lights, shadows, simulated
 from capture_sim.materials import Material
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer, camera_rays, towards_camera
 from capture_sim.surface import SurfacePoints, surface_points
+from capture_sim.visibility import (
+    TracedLights,
+    trace_lights,
+    worth_tracing,
+)
+from capture_sim.visibility import lit_pairs as lit_lights
 
 Table = Mapping[str, Any]
 Array = NDArray[np.float64]
@@ -33,7 +43,7 @@ PAIRS_PER_BLOCK = 1 << 16
 # Values of all photographs of one view held at once, before they are written.
 VALUES_PER_BATCH = 1 << 25
 # Rays searched for outlines at once.
-RAYS_PER_BLOCK = 1 << 21
+RAYS_PER_BLOCK = 1 << 19
 # A jump along the ray within a pixel above this part of the object's radius is an edge.
 EDGE_STEP = 0.04
 
@@ -47,15 +57,18 @@ class ViewSamples:
     camera : dict
     points : SurfacePoints
         Sorted by pixel; n of them.
-    pixel_from_point : (h * w, n) sparse float64
-        Weights; rows sum to the coverage of the pixel.
+    pixel : (n,) int64
+        Index ``row * w + column`` of the pixel that each point is part of.
+    weight : (n,) float64
+        Part of the pixel; the sum over a pixel is its coverage.
     coverage : (h, w) float32
         Part of each pixel that the object takes, in [0, 1].
     """
 
     camera: Table
     points: SurfacePoints
-    pixel_from_point: csr_array
+    pixel: NDArray[np.int64]
+    weight: Array
     coverage: NDArray[np.float32]
 
 
@@ -74,27 +87,149 @@ def sample_view(scene: Scene, tracer: RayTracer, camera: Table) -> ViewSamples:
     Returns
     -------
     ViewSamples
+
+    Notes
+    -----
+    Pixels are searched with the rays that shade them, at least two by two. Those
+    whose neighbourhood these rays find on both sides of an outline are sampled again
+    with the finer grid. What is smaller than the distance between rays in every pixel
+    about it is missed.
     """
     per_side, per_side_at_edges = rays_per_side(scene)
-    coverage, edge = _coverage(scene, tracer, camera, per_side_at_edges)
-    inside = np.flatnonzero((coverage > 0.0) & ~edge)
-    hits = [
-        _sub_pixel_hits(tracer, camera, inside, per_side),
-        _sub_pixel_hits(tracer, camera, np.flatnonzero(edge), per_side_at_edges),
-    ]
-    pixel, weight, face, barycentric = (
-        np.concatenate(part) for part in zip(*hits, strict=True)
-    )
-    order = np.argsort(pixel, kind="stable")
-    points = surface_points(scene.mesh, scene.material, face[order], barycentric[order])
+    step = EDGE_STEP * scene.mesh.radius
+    n_pixels = int(camera["h"]) * int(camera["w"])
+    search = per_side if per_side == per_side_at_edges else max(per_side, 2)
+    found = _trace_pixels(tracer, camera, np.arange(n_pixels), search)
+    covered, edge = found.coverage, np.zeros(n_pixels, dtype=bool)
+    samples = found.samples
+    if per_side_at_edges > per_side:
+        near = np.flatnonzero(_near_outline(found, int(camera["w"]), step))
+        finer = _trace_pixels(tracer, camera, near, per_side_at_edges)
+        covered[near], edge[near] = finer.coverage, finer.crossed(step)
+        if search != per_side:
+            inside = np.flatnonzero((covered > 0.0) & ~edge)
+            samples = _trace_pixels(tracer, camera, inside, per_side).samples
+        samples = samples.where(~edge[samples.pixel]).joined(
+            finer.samples.where(edge[finer.samples.pixel])
+        )
+    return _view_samples(scene, camera, samples, covered)
+
+
+def _view_samples(
+    scene: Scene, camera: Table, samples: PixelSamples, covered: Array
+) -> ViewSamples:
+    ordered = samples.where(np.argsort(samples.pixel, kind="stable"))
     shape = (int(camera["h"]), int(camera["w"]))
-    entries = (weight[order], (pixel[order], np.arange(len(order))))
     return ViewSamples(
         camera=camera,
-        points=points,
-        pixel_from_point=csr_array(entries, shape=(shape[0] * shape[1], len(order))),
-        coverage=coverage.reshape(shape).astype(np.float32),
+        points=surface_points(scene.mesh, scene.material, ordered.face, ordered.barycentric),
+        pixel=ordered.pixel,
+        weight=ordered.weight,
+        coverage=covered.reshape(shape).astype(np.float32),
     )
+
+
+@dataclass(frozen=True)
+class PixelSamples:
+    """Hits of rays through pixels.
+
+    Attributes
+    ----------
+    pixel : (n,) int64
+    weight : (n,) float64
+        Part of the pixel that the ray stands for.
+    face : (n,) int64
+        Triangle.
+    barycentric : (n, 3) float64
+    """
+
+    pixel: NDArray[np.int64]
+    weight: Array
+    face: NDArray[np.int64]
+    barycentric: Array
+
+    def where(self, chosen: NDArray[Any]) -> PixelSamples:
+        """Samples chosen by an index array or a boolean array."""
+        return PixelSamples(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def joined(self, other: PixelSamples) -> PixelSamples:
+        """These samples and others."""
+        names = [field.name for field in fields(self)]
+        pairs = ((getattr(self, name), getattr(other, name)) for name in names)
+        return PixelSamples(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class TracedPixels:
+    """What a regular grid of rays through each of some pixels met.
+
+    Attributes
+    ----------
+    coverage : (n_pixels,) float64
+        Part of the rays that hit.
+    nearest, farthest : (n_pixels,) float32
+        Distances along the rays, metres; infinite and 0 where none hit.
+    samples : PixelSamples
+        All hits, pixel by pixel.
+    """
+
+    coverage: Array
+    nearest: NDArray[np.float32]
+    farthest: NDArray[np.float32]
+    samples: PixelSamples
+
+    def crossed(self, step: float) -> NDArray[np.bool_]:
+        """True for pixels whose rays hit and miss, or reach depths `step` apart."""
+        partly = (self.coverage > 0.0) & (self.coverage < 1.0)
+        return partly | ((self.coverage == 1.0) & (self.farthest - self.nearest > step))
+
+
+def _trace_pixels(
+    tracer: RayTracer, camera: Table, pixels: NDArray[np.intp], per_side: int
+) -> TracedPixels:
+    """Trace a grid of rays through each of some pixels, block by block."""
+    rows = max(1, RAYS_PER_BLOCK // per_side**2)
+    starts = range(0, max(len(pixels), 1), rows)
+    parts = [
+        _trace_block(tracer, camera, pixels[first : first + rows], per_side) for first in starts
+    ]
+    return TracedPixels(
+        coverage=np.concatenate([part.coverage for part in parts]),
+        nearest=np.concatenate([part.nearest for part in parts]),
+        farthest=np.concatenate([part.farthest for part in parts]),
+        samples=reduce(PixelSamples.joined, (part.samples for part in parts)),
+    )
+
+
+def _trace_block(
+    tracer: RayTracer, camera: Table, pixels: NDArray[np.intp], per_side: int
+) -> TracedPixels:
+    hits = tracer.first_hits(*_sub_pixel_rays(camera, pixels, per_side))
+    distance = hits.distance.reshape(len(pixels), per_side**2)
+    hit = hits.hit.reshape(distance.shape)
+    pixel = np.repeat(pixels, per_side**2)[hits.hit]
+    weight = np.full(len(pixel), 1.0 / per_side**2)
+    return TracedPixels(
+        coverage=hit.mean(axis=1),
+        nearest=distance.min(axis=1, initial=np.inf),
+        farthest=np.where(hit, distance, 0.0).max(axis=1, initial=0.0),
+        samples=PixelSamples(pixel, weight, hits.face[hits.hit], hits.barycentric[hits.hit]),
+    )
+
+
+def _near_outline(found: TracedPixels, width: int, step: float) -> NDArray[np.bool_]:
+    """Pixels with rays on both sides of an outline among theirs and their neighbours'."""
+
+    def around(values: NDArray[Any], extreme: Any) -> NDArray[Any]:
+        return np.asarray(extreme(values.reshape(-1, width), size=3)).ravel()
+
+    any_hit = around(found.coverage > 0.0, maximum_filter)
+    all_hit = around(found.coverage == 1.0, minimum_filter)
+    nearest = around(found.nearest, minimum_filter)
+    farthest = around(found.farthest, maximum_filter)
+    jumps = np.zeros(len(nearest), dtype=bool)
+    np.greater(farthest - nearest, step, out=jumps, where=all_hit)
+    return (any_hit & ~all_hit) | jumps
 
 
 def rays_per_side(scene: Scene) -> tuple[int, int]:
@@ -125,24 +260,6 @@ def arriving_light(
     return near_lights.far_field(lights, scene.mesh.centre, points)
 
 
-def _coverage(
-    scene: Scene, tracer: RayTracer, camera: Table, per_side: int
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Covered part of each pixel and whether an outline crosses it, both (h * w,)."""
-    n_pixels = int(camera["h"]) * int(camera["w"])
-    step = EDGE_STEP * scene.mesh.radius
-    coverage, edge = np.zeros(n_pixels), np.zeros(n_pixels, dtype=bool)
-    rows = max(1, RAYS_PER_BLOCK // per_side**2)
-    for first in range(0, n_pixels, rows):
-        block = np.arange(first, min(first + rows, n_pixels))
-        hits = tracer.first_hits(*_sub_pixel_rays(camera, block, per_side))
-        face = hits.face.reshape(len(block), -1)
-        coverage[block] = (face >= 0).mean(axis=1)
-        distance = hits.distance.reshape(face.shape)
-        edge[block] = antialiasing.crossed_by_outline(face, distance, step)
-    return coverage, edge
-
-
 def _sub_pixel_rays(
     camera: Table, pixels: NDArray[np.intp], per_side: int
 ) -> tuple[Array, Array]:
@@ -151,49 +268,6 @@ def _sub_pixel_rays(
     corners = np.stack([column, row], axis=1).astype(np.float64)
     grid = antialiasing.sub_pixel_grid(per_side)
     return camera_rays(camera, (corners[:, None] + grid).reshape(-1, 2))
-
-
-def _sub_pixel_hits(
-    tracer: RayTracer, camera: Table, pixels: NDArray[np.intp], per_side: int
-) -> tuple[NDArray[np.intp], Array, NDArray[np.int64], Array]:
-    """Pixel, weight, face and barycentric position of all hits in some pixels."""
-    hits = tracer.first_hits(*_sub_pixel_rays(camera, pixels, per_side))
-    pixel = np.repeat(pixels, per_side**2)[hits.hit]
-    weight = np.full(len(pixel), 1.0 / per_side**2)
-    return pixel, weight, hits.face[hits.hit], hits.barycentric[hits.hit]
-
-
-def apparent_reflectance(
-    scene: Scene,
-    tracer: RayTracer,
-    points: SurfacePoints,
-    views: Array,
-    arriving: near_lights.Illumination,
-) -> NDArray[np.float32]:
-    """BRDF times cosine times visibility of the light, for every light.
-
-    Parameters
-    ----------
-    scene : Scene
-        Gives the material and decides on shadows.
-    tracer : RayTracer
-        Of the scene's mesh.
-    points : SurfacePoints
-        Where; n of them.
-    views : (n, 3) float64
-        Unit directions to the viewer, world.
-    arriving : Illumination
-        Light at the points.
-
-    Returns
-    -------
-    (n, n_lights, 3) float32
-        1/sr. Zero where the light is below the shading horizon or hidden, or
-        the viewer is below the shading horizon.
-    """
-    seen = np.einsum("nj,nj->n", points.shading_from_world[:, 2], views) > 0.0
-    lit, cosine = lit_pairs(scene, tracer, points, arriving, seen)
-    return reflectance_of_pairs(scene.material, points, views, arriving.directions, lit, cosine)
 
 
 def reflectance_of_pairs(
@@ -276,7 +350,11 @@ def lit_pairs(
 
 
 def shade(
-    scene: Scene, tracer: RayTracer, view: ViewSamples, lights: tuple[Table, ...]
+    scene: Scene,
+    tracer: RayTracer,
+    view: ViewSamples,
+    lights: tuple[Table, ...],
+    traced: TracedLights | None = None,
 ) -> NDArray[np.float32]:
     """Photographs of one view under some lights.
 
@@ -290,38 +368,126 @@ def shade(
         From `sample_view`.
     lights : tuple of dict
         Lights of the native capture format.
+    traced : TracedLights, optional
+        Visibility of these lights, from `traced_lights`.
 
     Returns
     -------
     (n_lights, h, w, 3) float32
         Linear radiance; the background is black.
     """
-    height, width = view.coverage.shape
-    total: Array = np.zeros((height * width, len(lights) * 3))
+    pixels, radiance = _lit_pixels(scene, tracer, view, lights, traced)
+    photographs = np.zeros((len(lights), view.coverage.size, 3), dtype=np.float32)
+    photographs[:, pixels] = radiance
+    return photographs.reshape(len(lights), *view.coverage.shape, 3)
+
+
+def _lit_pixels(
+    scene: Scene,
+    tracer: RayTracer,
+    view: ViewSamples,
+    lights: tuple[Table, ...],
+    traced: TracedLights | None,
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Pixels that show the object (n,), and their radiance (n_lights, n, 3)."""
+    arrays = LightArrays.of(scene, lights)
+    pixels, row = np.unique(view.pixel, return_inverse=True)
+    radiance = np.zeros((len(pixels), 3, len(lights)), dtype=np.float32)
     step = max(1, PAIRS_PER_BLOCK // len(lights))
     for first in range(0, len(view.points), step):
         block = slice(first, first + step)
-        points = view.points[block]
-        arriving = arriving_light(scene, lights, points.position)
-        views = towards_camera(view.camera, points.position)
-        reflectance = apparent_reflectance(scene, tracer, points, views, arriving)
-        radiance = (reflectance * arriving.irradiance).reshape(len(points), -1)
-        rows, weights = _weights_of_block(view.pixel_from_point, block)
-        total[rows] += weights @ radiance
-    by_light = np.moveaxis(total.reshape(height, width, len(lights), 3), 2, 0)
-    return np.ascontiguousarray(by_light, dtype=np.float32)
+        points, weight = view.points[block], view.weight[block].astype(np.float32)
+        values, strength = _shaded(scene, tracer, view.camera, points, arrays, traced)
+        colour = arrays.colour.T.astype(np.float32)
+        _gather(values, strength, colour, row[block], weight, radiance)
+    by_light = np.zeros((len(lights), len(pixels), 3), dtype=np.float32)
+    _by_light(radiance, by_light)
+    return pixels, by_light
 
 
-def _weights_of_block(pixel_from_point: csr_array, block: slice) -> tuple[slice, csr_array]:
-    """Rows that a block of points (sorted by pixel) touches, and their weights."""
-    columns = pixel_from_point[:, block]
-    touched = np.flatnonzero(np.diff(columns.indptr))
-    rows = slice(int(touched[0]), int(touched[-1]) + 1)
-    return rows, columns[rows]
+def _shaded(
+    scene: Scene,
+    tracer: RayTracer,
+    camera: Table,
+    points: SurfacePoints,
+    lights: LightArrays,
+    traced: TracedLights | None,
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """BRDF (n, 3, n_lights), and irradiance (n, n_lights), 0 for lights that do not count."""
+    precision = scene.material.precision
+    views = towards_camera(camera, points.position)
+    local_views = np.einsum("nij,nj->ni", points.shading_from_world, views)
+    directions, strength = lights.arrive(points.position, points.shading_from_world, precision)
+    cosine = directions[:, 2]
+    seen = local_views[:, 2] > 0.0
+    if simulated(scene, shadows):
+        lit = lit_lights(tracer, points, seen, cosine, lights, traced)
+    else:
+        lit = (cosine > 0.0) & seen[:, None]
+    strength *= np.where(lit, cosine, 0)
+    local_views = local_views.astype(precision)
+    return scene.material.evaluate_lights(local_views, directions, lit, points.uv), strength
+
+
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_Values = NDArray[Any]
+
+
+@_compiled
+def _gather(
+    values: _Values,
+    strength: _Values,
+    colour: _Values,
+    row: _Values,
+    weight: _Values,
+    radiance: _Values,
+) -> None:
+    """Add the points' light (n, 3, n_lights) to that of their pixels."""
+    number = radiance.dtype.type
+    for n in range(len(values)):
+        for c in range(3):
+            for k in range(strength.shape[1]):
+                # Values of lights that do not count may be anything, even NaN.
+                if strength[n, k] > 0.0:
+                    shining = number(values[n, c, k] * strength[n, k])
+                    radiance[row[n], c, k] += weight[n] * colour[c, k] * shining
+
+
+@_compiled
+def _by_light(radiance: _Values, by_light: _Values) -> None:
+    """Carry (n, 3, n_lights) over to (n_lights, n, 3)."""
+    block = 32  # rows that stay in the cache while all lights take their part
+    for first in range(0, len(radiance), block):
+        stop = min(first + block, len(radiance))
+        for k in range(radiance.shape[2]):
+            for n in range(first, stop):
+                for c in range(3):
+                    by_light[k, n, c] = radiance[n, c, k]
+
+
+def traced_lights(scene: Scene, tracer: RayTracer) -> TracedLights | None:
+    """Visibility of the scene's lights all over the object, where that saves work.
+
+    Parameters
+    ----------
+    scene : Scene
+    tracer : RayTracer
+        Of the scene's mesh.
+
+    Returns
+    -------
+    TracedLights or None
+        None if shadows are off, or views are so few that every ray of theirs is traced.
+    """
+    nodes = worth_tracing(scene)
+    if nodes is None:
+        return None
+    with scene.costs.measure(shadows.NAME):
+        return trace_lights(scene, tracer, LightArrays.of(scene, scene.lights), nodes)
 
 
 def render_view(
-    scene: Scene, tracer: RayTracer, view: ViewSamples
+    scene: Scene, tracer: RayTracer, view: ViewSamples, traced: TracedLights | None = None
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """All photographs of one view, a bounded number held in memory at a time.
 
@@ -333,6 +499,8 @@ def render_view(
         Of the scene's mesh.
     view : ViewSamples
         From `sample_view`.
+    traced : TracedLights, optional
+        From `traced_lights`.
 
     Yields
     ------
@@ -343,5 +511,11 @@ def render_view(
     """
     step = max(1, VALUES_PER_BATCH // (3 * view.coverage.size))
     for first in range(0, len(scene.lights), step):
-        images = shade(scene, tracer, view, scene.lights[first : first + step])
-        yield from enumerate(images, start=first)
+        lights = scene.lights[first : first + step]
+        chosen = np.arange(first, first + len(lights))
+        known = None if traced is None else traced.some(chosen)
+        pixels, by_light = _lit_pixels(scene, tracer, view, lights, known)
+        for light, radiance in enumerate(by_light, start=first):
+            photograph = np.zeros((view.coverage.size, 3), dtype=np.float32)
+            photograph[pixels] = radiance
+            yield light, photograph.reshape(*view.coverage.shape, 3)

@@ -38,6 +38,10 @@ class SurfacePoints:
         Texture coordinates.
     label : (n,) int16
         Index of the material.
+    face : (n,) int64
+        Triangle.
+    barycentric : (n, 3) float64
+        Weights of the triangle's corners.
     """
 
     position: Array
@@ -47,6 +51,8 @@ class SurfacePoints:
     shading_from_world: Array
     uv: Array
     label: NDArray[np.int16]
+    face: NDArray[np.int64]
+    barycentric: Array
 
     def __len__(self) -> int:
         return len(self.position)
@@ -93,7 +99,38 @@ def surface_points(
         shading_from_world=material.frame_change(uv) @ surface_from_world,
         uv=uv,
         label=material.label(uv).astype(np.int16),
+        face=face,
+        barycentric=barycentric,
     )
+
+
+def shadow_starts(
+    mesh: SurfaceMesh, face: NDArray[np.int64], barycentric: Array, offset: float
+) -> tuple[Array, Array]:
+    """Where shadow rays begin, and the smooth normals there.
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+        The true surface.
+    face : (n,) int
+        Triangles.
+    barycentric : (n, 3) float
+        Weights of the triangles' corners.
+    offset : float
+        Metres above the smooth surface, along the normals of the triangles.
+
+    Returns
+    -------
+    starts, normals : (n, 3) float64
+        World; normals need not be unit.
+    """
+    corners = mesh.faces[face]
+    corner_positions, corner_normals = mesh.vertices[corners], mesh.normals[corners]
+    position = _interpolated(corner_positions, barycentric)
+    lifted = _lifted(position, corner_positions, corner_normals, barycentric)
+    starts = lifted + offset * _face_normals(corner_positions)
+    return starts, _interpolated(corner_normals, barycentric)
 
 
 def orthonormal_frames(normals: Array, tangents: Array) -> Array:

@@ -24,8 +24,9 @@ from capture_sim.files import write_exr, write_json, write_png, write_silhouette
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup, photographs, set_up
 from capture_sim.rays import RayTracer
-from capture_sim.render import sample_view
+from capture_sim.render import sample_view, traced_lights
 from capture_sim.truth import write_truth, write_view_truth
+from capture_sim.visibility import TracedLights
 
 Table = Mapping[str, Any]
 
@@ -127,15 +128,19 @@ def _move_into_place(part: Path, folder: Path) -> None:
 
 
 def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
-    tracer = RayTracer(scene.mesh, n_threads=1 if workers > 1 else 0)
+    # One thread traces at a time, on behalf of all.
+    tracer = RayTracer(scene.mesh, n_threads=workers)
     setup = set_up(measured(scene, tracer))
+    traced = traced_lights(setup.real, tracer)
     for name in ("photographs", "silhouettes"):
         (folder / name).mkdir()
     steps = len(scene.cameras) + 1
     progress(0, steps)
     with ThreadPoolExecutor(workers) as pool:
         views = range(len(scene.cameras))
-        futures = [pool.submit(_write_view, setup, tracer, view, folder) for view in views]
+        futures = [
+            pool.submit(_write_view, setup, tracer, traced, view, folder) for view in views
+        ]
         try:
             for done, future in enumerate(as_completed(futures), start=1):
                 future.result()
@@ -148,13 +153,15 @@ def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
     progress(steps, steps)
 
 
-def _write_view(setup: Setup, tracer: RayTracer, index: int, folder: Path) -> None:
+def _write_view(
+    setup: Setup, tracer: RayTracer, traced: TracedLights | None, index: int, folder: Path
+) -> None:
     scene = setup.real
     camera = scene.cameras[index]
     view = sample_view(scene, tracer, camera)
     write_silhouette(folder / _silhouette(camera), view.coverage)
     lights = np.flatnonzero(setup.rig.taken[index])
-    for frame, radiance in photographs(scene, tracer, index, lights, view):
+    for frame, radiance in photographs(scene, tracer, index, lights, view, traced):
         _write_photograph(scene, folder, frame, radiance)
     if scene.truth.per_view:
         write_view_truth(scene, tracer, camera, folder)

@@ -6,18 +6,28 @@ Every parameter is a `Texture`, so that each may vary over the surface.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from capture_sim.materials import kernels
 from capture_sim.materials.base import (
     SMALLEST_DENOMINATOR,
     Array,
+    Floats,
     Material,
     coupled_diffuse,
     half_vectors,
     schlick,
 )
 from capture_sim.materials.textures import Texture
+
+# Half vectors in float32 are off by about 6e-8; a lobe of width alpha magnifies that by
+# 4 / alpha: 1e-5 of its value at this roughness.
+SHARP_ALPHA = 0.024
+
+Flags = NDArray[np.bool_]
 
 
 class _Parametric(Material):
@@ -50,6 +60,12 @@ class Lambert(_Parametric):
 
     def _reflect(self, views: Array, lights: Array, uv: Array) -> Array:
         return self.albedo.rgb(uv) / np.pi
+
+    def evaluate_lights(self, views: Floats, lights: Floats, lit: Flags, uv: Array) -> Floats:
+        """Albedo / pi for every light; see `Material.evaluate_lights`."""
+        values = np.zeros_like(lights)
+        kernels.lambert(_like(views, self.albedo.rgb(uv)), values)
+        return values
 
 
 @dataclass(frozen=True)
@@ -98,6 +114,26 @@ class AshikhminShirley(_Parametric):
         lobe /= 4.0 * np.maximum(cosine * larger, SMALLEST_DENOMINATOR)
         shine = lobe * schlick(specular, cosine)
         return shine + coupled_diffuse(self.diffuse.rgb(uv), specular, views, lights)
+
+    def evaluate_lights(self, views: Floats, lights: Floats, lit: Flags, uv: Array) -> Floats:
+        """Compiled `evaluate`; see `Material.evaluate_lights`."""
+        values = np.zeros_like(lights)
+        specular = _like(views, self.specular.rgb(uv))
+        exponents = np.hstack([self.exponent_u.scalar(uv), self.exponent_v.scalar(uv)])
+        kernels.phong(views, lights, lit, specular, _like(views, exponents), values)
+        albedo = _like(views, self.diffuse.rgb(uv))
+        kernels.add_coupled_diffuse(views, lights, albedo, specular, values)
+        return values
+
+    @property
+    def precision(self) -> type[np.floating[Any]]:
+        """float64: exponents magnify the rounding of half vectors."""
+        return np.float64
+
+
+def _like(views: Floats, parameters: Array) -> Floats:
+    """Parameters of points in the floating-point type of the directions."""
+    return np.ascontiguousarray(parameters, dtype=views.dtype)
 
 
 def phong_density(halves: Array, exponent_u: Array, exponent_v: Array) -> Array:
@@ -191,6 +227,29 @@ class GGX(_Parametric):
             return shine
         at_normal = self._fresnel(np.ones((1, 1)), uv)
         return shine + coupled_diffuse(self.diffuse.rgb(uv), at_normal, views, lights)
+
+    def evaluate_lights(self, views: Floats, lights: Floats, lit: Flags, uv: Array) -> Floats:
+        """Compiled `evaluate`; see `Material.evaluate_lights`."""
+        values = np.zeros_like(lights)
+        alphas = np.hstack([self.alpha_x.scalar(uv), self.alpha_y.scalar(uv)])
+        kernels.ggx(views, lights, _like(views, alphas), self.correlated, values)
+        specular = _like(views, self.specular.rgb(uv))
+        if self.conductor is None:
+            kernels.schlick_colours(specular, values)
+        else:
+            eta, kappa = (_like(views, np.array(row)) for row in self.conductor)
+            kernels.metal_colours(specular, eta, kappa, values)
+        if self.diffuse.bounds != (0.0, 0.0):
+            at_normal = _like(views, self._fresnel(np.ones((len(uv), 1)), uv))
+            albedo = _like(views, self.diffuse.rgb(uv))
+            kernels.add_coupled_diffuse(views, lights, albedo, at_normal, values)
+        return values
+
+    @property
+    def precision(self) -> type[np.floating[Any]]:
+        """float64 for lobes that are too sharp for float32."""
+        sharpest = min(self.alpha_x.bounds[0], self.alpha_y.bounds[0])
+        return np.float64 if sharpest < SHARP_ALPHA else np.float32
 
     def _fresnel(self, cosine: Array, uv: Array) -> Array:
         if self.conductor is None:

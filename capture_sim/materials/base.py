@@ -8,11 +8,13 @@ cosine of the light.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 # Both directions on the horizon make the denominators of the microfacet models
 # vanish; below this cosine product the surface is seen edge on and unlit.
@@ -50,6 +52,50 @@ class Material(ABC):
     @abstractmethod
     def _reflect(self, views: Array, lights: Array, uv: Array) -> Array:
         """BRDF of directions that are all above the horizon, (n, 3)."""
+
+    def evaluate_lights(
+        self, views: Floats, lights: Floats, lit: NDArray[np.bool_], uv: Array
+    ) -> Floats:
+        """BRDF values of points that each have the same number of lights.
+
+        The same as `evaluate`, in an order and a precision made for speed.
+
+        Parameters
+        ----------
+        views : (n, 3) float32 or float64
+            Unit directions to the viewer, shading frame.
+        lights : (n, 3, n_lights) like `views`
+            Unit directions to the lights, shading frame.
+        lit : (n, n_lights) bool
+            Pairs that are wanted, all with both directions above the horizon.
+        uv : (n, 2) float64
+            Texture coordinates.
+
+        Returns
+        -------
+        (n, 3, n_lights) like `views`
+            1/sr, linear RGB; finite or not, but of no meaning where not `lit`.
+
+        Notes
+        -----
+        This general form gathers the wanted pairs; materials with a compiled
+        kernel override it.
+        """
+        point, light = np.nonzero(lit)
+        values = np.zeros_like(lights)
+        # float64 whatever comes in: the measured tables are searched in it.
+        pairs = self._reflect(
+            views[point].astype(np.float64),
+            lights[point, :, light].astype(np.float64),
+            uv[point],
+        )
+        values[point, :, light] = pairs
+        return values
+
+    @property
+    def precision(self) -> type[np.floating[Any]]:
+        """Type in which `evaluate_lights` keeps about five digits."""
+        return np.float32
 
     def frame_change(self, uv: Array) -> Array:
         """Rotation into the shading frame, ``shading_from_surface``.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.materials.base import Array, Material
+from capture_sim.materials.base import Array, Floats, Material
 from capture_sim.materials.textures import Constant, Texture
 
 WHITE = Constant((1.0,))
@@ -55,6 +56,20 @@ class SpatiallyVarying(Material):
 
     def _reflect(self, views: Array, lights: Array, uv: Array) -> Array:
         return self.tint.rgb(uv) * self.base.evaluate(views, lights, uv)
+
+    def evaluate_lights(
+        self, views: Floats, lights: Floats, lit: NDArray[np.bool_], uv: Array
+    ) -> Floats:
+        """Values of the base, tinted; see `Material.evaluate_lights`."""
+        values = self.base.evaluate_lights(views, lights, lit, uv)
+        if self.tint.bounds != (1.0, 1.0):
+            values *= self.tint.rgb(uv)[:, :, None].astype(values.dtype)
+        return values
+
+    @property
+    def precision(self) -> type[np.floating[Any]]:
+        """That of the base."""
+        return self.base.precision
 
     def frame_change(self, uv: Array) -> Array:
         """``shading_from_surface``, (n, 3, 3); see `Material.frame_change`."""
@@ -113,6 +128,27 @@ class Mixed(Material):
             here = labels == index
             values[here] = material.evaluate(views[here], lights[here], uv[here])
         return values
+
+    def evaluate_lights(
+        self, views: Floats, lights: Floats, lit: NDArray[np.bool_], uv: Array
+    ) -> Floats:
+        """Values of the material at each point; see `Material.evaluate_lights`."""
+        labels, values = self.label(uv), np.zeros_like(lights)
+        for index, material in enumerate(self.materials):
+            here = np.flatnonzero(labels == index)
+            if len(here) == len(uv):
+                return material.evaluate_lights(views, lights, lit, uv)
+            if len(here):
+                values[here] = material.evaluate_lights(
+                    views[here], lights[here], lit[here], uv[here]
+                )
+        return values
+
+    @property
+    def precision(self) -> type[np.floating[Any]]:
+        """float64 if any of the materials needs it."""
+        exact = any(material.precision is np.float64 for material in self.materials)
+        return np.float64 if exact else np.float32
 
     def frame_change(self, uv: Array) -> Array:
         """``shading_from_surface`` of the material at each point, (n, 3, 3)."""

@@ -65,6 +65,57 @@ def test_reciprocal_and_not_negative(name, rng, rounding):
     np.testing.assert_allclose(forth, back, rtol=rounding(float, operations=64))
 
 
+COMPILED = {
+    **ANALYTIC,
+    "sharp": {"type": "ggx", "specular": 0.5, "diffuse": 0.1, "alpha": 1e-3},
+    **{name: {"preset": name} for name in ("satin", "painted_vase", "greek_key")},
+}
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_compiled_values_are_those_of_the_formulas(name, rng, rounding):
+    material = make_material(COMPILED[name])
+    n, n_lights = 200, 17
+    views, uv = upper_directions(rng, n), rng.random((n, 2))
+    lights = upper_directions(rng, n * n_lights).reshape(n, n_lights, 3)
+    # Half of the lights near the mirror direction, where lobes are steepest.
+    mirrored = views[:, None] * [-1, -1, 1] + 0.05 * rng.normal(size=(n, n_lights, 3))
+    lights[:, ::2] = mirrored[:, ::2]
+    lights[..., 2] = np.abs(lights[..., 2])
+    lights /= np.linalg.norm(lights, axis=-1, keepdims=True)
+    expected = material.evaluate(
+        np.repeat(views, n_lights, axis=0),
+        lights.reshape(-1, 3),
+        np.repeat(uv, n_lights, axis=0),
+    ).reshape(n, n_lights, 3)
+    lit = rng.random((n, n_lights)) < 0.8
+    precision = material.precision
+    by_light = np.ascontiguousarray(np.moveaxis(lights, 1, 2), dtype=precision)
+    values = material.evaluate_lights(views.astype(precision), by_light, lit, uv)
+    assert values.dtype == precision
+    error = np.where(lit[..., None], np.moveaxis(values, 1, 2) - expected, 0.0)
+    assert np.linalg.norm(error) < 1e-5 * np.linalg.norm(expected)
+    # Rounded half vectors move a lobe of width alpha by 4 eps / alpha; the sharpest in
+    # float32 has alpha 0.024, and grazing pairs lose another digit.
+    condition = 40 / 0.024 if precision is np.float32 else 40 / 1e-3
+    bound = rounding(precision, condition=condition) * (expected + 1e-3)
+    assert (np.abs(error) <= bound).all()
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("name", COMPILED)
+def test_compiled_values_are_finite_at_the_horizon(name):
+    material = make_material(COMPILED[name])
+    grazing = np.array([[1.0, 0.0, 1e-7], [0.0, 1.0, 1e-12], [0.0, 0.0, 1.0]])
+    lights = np.stack([grazing * [-1, -1, 1], grazing, grazing[::-1]], axis=2)
+    precision = material.precision
+    values = material.evaluate_lights(
+        grazing.astype(precision), lights.astype(precision), np.ones((3, 3), bool), UV[[0] * 3]
+    )
+    assert np.isfinite(values).all()
+    assert (values >= 0.0).all()
+
+
 @pytest.mark.parametrize("name", ANALYTIC)
 @pytest.mark.parametrize("inclination", [0.0, 0.6, 1.2, 1.5])
 def test_white_furnace(name, inclination):

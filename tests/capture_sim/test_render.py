@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from capture_sim import render
+from capture_sim.arrival import LightArrays
 from capture_sim.effects import near_lights
 from capture_sim.files import write_ply
+from capture_sim.materials import make_material
 from capture_sim.rays import RayTracer, camera_rays, towards_camera
 from capture_sim.render import sample_view, shade
 from capture_sim.scene import EffectOptions, ImageOptions, parse_scene
 from capture_sim.surface import surface_points
 from capture_sim.truth import area_uniform_points, lights_visible
+from capture_sim.visibility import Nodes, TracedLights, trace_lights
 
 ONE_RAY = ImageOptions(samples_per_side=1, edge_samples_per_side=1)
 
@@ -157,6 +160,102 @@ def test_blocks_do_not_change_the_picture(monkeypatch, rounding):
     np.testing.assert_allclose(
         photographs(scene), whole, rtol=rounding(np.float32), atol=rounding(np.float32)
     )
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+@pytest.mark.parametrize("material", ["painted_vase", "satin"])
+def test_photographs_are_the_sum_over_pairs(kind, material):
+    scene = scene_of(
+        {"preset": "amphora", "around": 48, "along": 48},
+        {"preset": material},
+        lights={"preset": "fibonacci", "n": 7, "kind": kind},
+    )
+    tracer = RayTracer(scene.mesh)
+    view = sample_view(scene, tracer, scene.cameras[0])
+    points = view.points
+    views = towards_camera(view.camera, points.position)
+    arriving = render.arriving_light(scene, scene.lights, points.position)
+    lit, cosine = render.lit_pairs(scene, tracer, points, arriving)
+    reflectance = render.reflectance_of_pairs(
+        scene.material, points, views, arriving.directions, lit, cosine
+    )
+    expected = np.zeros((view.coverage.size, 7, 3))
+    weighted = view.weight[:, None, None] * reflectance * arriving.irradiance
+    np.add.at(expected, view.pixel, weighted)
+    image = shade(scene, tracer, view, scene.lights)
+    expected = np.moveaxis(expected, 1, 0).reshape(image.shape)
+    assert (expected > 0).any(axis=(1, 2, 3)).all()
+    # The compiled BRDFs keep five digits; see `Material.precision`.
+    assert np.linalg.norm(image - expected) < 1e-5 * np.linalg.norm(expected)
+
+
+def test_visibility_known_beforehand_changes_next_to_nothing():
+    scene = scene_of(
+        {"preset": "amphora", "around": 64, "along": 64},
+        {"preset": "grey_card"},
+        cameras={"width": 64, "height": 64, "target": [0, 0, 0.1]},
+        lights={"preset": "fibonacci", "n": 70, "target": [0, 0, 0.1]},
+    )
+    tracer = RayTracer(scene.mesh, n_threads=0)
+    view = sample_view(scene, tracer, scene.cameras[0])
+    nodes = Nodes.of(scene.mesh, 0.006)
+    traced = trace_lights(scene, tracer, LightArrays.of(scene, scene.lights), nodes)
+    exact, shared = (shade(scene, tracer, view, scene.lights, t) for t in (None, traced))
+    assert (exact > 0).any()
+    changed = (exact != shared).any(axis=-1)
+    # 1.5e-5 of the pixels were measured at 256 px.
+    assert changed.mean() < 1e-4
+    assert np.linalg.norm(exact - shared) < 2e-3 * np.linalg.norm(exact)
+
+
+def test_some_lights_of_those_traced():
+    scene = scene_of(
+        {"preset": "amphora", "around": 24, "along": 24},
+        {"preset": "grey_card"},
+        lights={"preset": "bonn151", "target": [0, 0, 0.1]},
+    )
+    tracer = RayTracer(scene.mesh)
+    view = sample_view(scene, tracer, scene.cameras[0])
+    nodes = Nodes.of(scene.mesh, 0.01)
+    whole = trace_lights(scene, tracer, LightArrays.of(scene, scene.lights), nodes)
+    together = shade(scene, tracer, view, scene.lights, whole)
+    chosen = np.array([140, 3, 70])
+    lights = tuple(scene.lights[k] for k in chosen)
+    alone = shade(scene, tracer, view, lights, whole.some(chosen))
+    assert (alone == together[chosen]).all()
+    assert (alone > 0).any(axis=(1, 2, 3)).all()
+
+
+@pytest.mark.stability
+def test_nodes_about_points_on_edges_and_corners():
+    mesh = scene_of({"preset": "sphere", "around": 24}, {"preset": "grey_card"}).mesh
+    nodes = Nodes.of(mesh, 0.004)
+    face, barycentric = nodes.places()
+    assert len(np.unique(nodes.per_side)) > 1
+    # One bit for each node, its index in the triangle: a node's own bit is among the three.
+    index = np.arange(len(nodes)) - nodes.first[face]
+    bits = (np.uint64(1) << (index % 64).astype(np.uint64))[:, None]
+    rng = np.random.default_rng(1)
+    shaken = barycentric + 1e-9 * rng.normal(size=barycentric.shape)
+    points = surface_points(mesh, make_material({"preset": "grey_card"}), face, shaken)
+    _, union = TracedLights(nodes, bits, np.arange(64)).agreed(points)
+    assert ((union & bits) == bits).all()
+
+
+@pytest.mark.parametrize("thing", ["amphora", "relief", "sphere"])
+def test_outlines_are_found_as_by_searching_everywhere(thing, monkeypatch):
+    scene = scene_of(
+        {"preset": thing},
+        {"preset": "grey_card"},
+        cameras={"width": 96, "height": 96, "target": [0, 0, 0.05]},
+    )
+    tracer = RayTracer(scene.mesh)
+    found = sample_view(scene, tracer, scene.cameras[0])
+    monkeypatch.setattr(render, "_near_outline", lambda found, *_: found.coverage >= 0.0)
+    everywhere = sample_view(scene, tracer, scene.cameras[0])
+    assert ((found.coverage > 0) & (found.coverage < 1)).sum() > 50
+    assert (found.coverage == everywhere.coverage).all()
+    assert (found.pixel == everywhere.pixel).all()
 
 
 def test_radiance_is_linear_in_the_light(rounding):
