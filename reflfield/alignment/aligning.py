@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.alignment.expectation import TargetFit, fit_targets, mean_targets
-from reflfield.alignment.gauge import Gauged, fix_gauge, fold
+from reflfield.alignment.gauge import Gauged, fix_gauge, fold, turn_targets
+from reflfield.alignment.horizon import Horizon, extend_targets, settle
 from reflfield.alignment.refinement import (
     NodeTargets,
     RefinementOptions,
@@ -17,8 +17,21 @@ from reflfield.alignment.refinement import (
     improve_frames,
     refine_targets,
 )
-from reflfield.alignment.searching import SearchResult, search
-from reflfield.checks import check_shape, unit_directions
+from reflfield.alignment.samples import (
+    SampleSource,
+    as_source,
+    blocks_of,
+    mean_samples,
+    read_unit,
+)
+from reflfield.alignment.searching import (
+    SearchOptions,
+    SearchResult,
+    map_blocks,
+    one_core_blas,
+    search,
+)
+from reflfield.checks import unit_directions
 from reflfield.errors import InputError, ShapeError
 from reflfield.progress import track
 from reflfield.sphere.coupling import Coupled, couple, join_coupled
@@ -29,34 +42,12 @@ from reflfield.sphere.projection import Projector
 # has converged far below the error of one frame.
 TRAINING_TEXELS = 8192
 TRAINING_BYTES = 256 * 2**20
-BLOCK_BYTES = 64 * 2**20
+# Texels projected at once.
+PROJECTION_BLOCK = 128
+# Rounds of filling in what lies below the base horizon: each leaves about a third of the error.
+EXTENSIONS = 4
 # Samples kept for the targets of the refinement.
 REFINING_BYTES = 256 * 2**20
-
-
-class SampleSource(Protocol):
-    """Samples read block by block, for example from a store on disk."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(n_texels, n_views, n_lights)."""
-
-    def read(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
-        """Samples of some texels, rows ascending; not finite where unobserved."""
-
-
-@dataclass(frozen=True, eq=False)
-class _ArraySource:
-    """Samples that are in memory already."""
-
-    samples: NDArray[np.floating]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.samples.shape
-
-    def read(self, rows: NDArray[np.int64]) -> NDArray[np.floating]:
-        return self.samples[rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +90,15 @@ class _Task:
 
     source: SampleSource
     projector: Projector
+    horizon: Horizon
     prior: NDArray[np.float32]
     max_tilt: float | None
     n_threads: int
+
+    @property
+    def search_options(self) -> SearchOptions:
+        """Those that all steps share."""
+        return {"max_tilt": self.max_tilt, "n_threads": self.n_threads}
 
 
 def align(
@@ -171,31 +168,49 @@ def align(
     ((1, 3, 3), array([0], dtype=int32))
     """
     # Check the input and build the operators that all texels share.
-    source = _as_source(samples)
+    source = as_source(samples)
     projector = _projector(source, views, lights, band_limit)
     _check_options(iterations, n_clusters, max_tilt, n_threads)
     rng = np.random.default_rng(seed)
-    # Keep the coefficients of some texels, and find targets and their frames.
     rows = _training_rows(source.shape[0], projector, rng)
-    task = _Task(source, projector, _prior(source, rows), max_tilt, n_threads)
-    training = join_coupled([_coupled(task, part) for part in _blocks(source, rows)])
-    fit = fit_targets(
-        training,
-        n_clusters=n_clusters,
-        iterations=iterations,
-        rng=rng,
-        max_tilt=max_tilt,
-        n_threads=n_threads,
-    )
-    # Give the frames a meaning, and sharpen the targets on samples.
-    weights = np.where(training.norms() > 0, np.maximum(fit.found.score, 0.0), 0.0)
-    gauged = fix_gauge(fit.targets, fit.found.rotations, fit.found.cluster, weights)
-    found = _search(task, training, gauged, gauged.rotations)
-    fit = replace(fit, targets=gauged.targets, found=found)
-    refinement = RefinementOptions() if refine is True else refine
-    sharp = _sharpen(task, rows, training, fit, refinement) if refinement else None
-    # Find the frames of all texels, block by block.
-    return _finish(task, rows, fit, gauged, sharp)
+    prior = mean_samples(source, rows)
+    task = _Task(source, projector, Horizon.of(projector), prior, max_tilt, n_threads)
+    with one_core_blas():
+        # Keep the coefficients of some texels, and find targets and their frames.
+        training = join_coupled([_coupled(task, part) for part in blocks_of(source, rows)])
+        fit = fit_targets(
+            training,
+            n_clusters=n_clusters,
+            iterations=iterations,
+            rng=rng,
+            max_tilt=max_tilt,
+            n_threads=n_threads,
+        )
+        # What no direction of the dome shows of a tilted texel is taken from the targets.
+        extended = extend_targets(training, fit, task.horizon, EXTENSIONS, task.search_options)
+        # Give the frames a meaning, and sharpen the targets on samples.
+        start = extended.found
+        weights = np.where(training.norms() > 0, np.maximum(start.score, 0.0), 0.0)
+        gauged = fix_gauge(extended.targets, start.rotations, start.cluster, weights)
+        aims = _Aims(turn_targets(fit.targets, gauged.turns), gauged)
+        found = _search(task, training, aims, gauged.rotations)
+        fit = replace(extended, targets=gauged.targets, found=found)
+        refinement = RefinementOptions() if refine is True else refine
+        sharp = _sharpen(task, rows, training, fit, refinement) if refinement else None
+        # Find the frames of all texels, block by block.
+        return _finish(task, rows, fit, aims, sharp)
+
+
+@dataclass(frozen=True, eq=False)
+class _Aims:
+    """Targets in one gauge: of the functions as they are, and as extended below the horizon.
+
+    The plain ones tell materials apart, since no target has had a hand in what they are
+    compared with; the extended ones give the frames.
+    """
+
+    plain: Coupled
+    extended: Gauged
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,9 +234,7 @@ def _sharpen(
     each = 4 * task.source.shape[1] * task.source.shape[2]
     most = min(options.texels_per_cluster * n_clusters, max(REFINING_BYTES // each, 64))
     some = np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))
-    parts = [
-        _unit_samples(_read(task.source, part)) for part in _blocks(task.source, rows[some])
-    ]
+    parts = [read_unit(task.source, part) for part in blocks_of(task.source, rows[some])]
     data = SampleSet(np.concatenate(parts), task.projector.views, task.projector.lights)
     found = fit.found
     frames = np.ascontiguousarray(np.swapaxes(found.rotations[some], 1, 2))
@@ -237,15 +250,6 @@ def _sharpen(
     means = mean_targets(training[some], weights, better, n_clusters)
     regauged = fix_gauge(means, better.rotations, cluster, weights)
     return _Sharp(targets, options, regauged)
-
-
-def _as_source(samples: ArrayLike | SampleSource) -> SampleSource:
-    if hasattr(samples, "read") and hasattr(samples, "shape"):
-        return samples  # type: ignore[return-value]
-    array = np.asarray(samples)
-    if array.dtype != np.float64:
-        array = array.astype(np.float32, copy=False)
-    return _ArraySource(array)
 
 
 def _projector(
@@ -293,55 +297,26 @@ def _training_rows(n: int, projector: Projector, rng: np.random.Generator) -> ND
     return np.sort(rng.choice(n, most, replace=False)) if most < n else np.arange(n)
 
 
-def _blocks(source: SampleSource, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Parts of `rows` whose samples fit the block size."""
-    each = max(1, BLOCK_BYTES // (4 * source.shape[1] * source.shape[2]))
-    return [rows[first : first + each] for first in range(0, len(rows), each)]
-
-
-def _prior(source: SampleSource, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Mean observed sample of each pair of directions, over some texels."""
-    total = np.zeros(source.shape[1:])
-    count = np.zeros(source.shape[1:])
-    for part in _blocks(source, rows[:: max(1, len(rows) // 1024)]):
-        block = _read(source, part)
-        observed = np.isfinite(block)
-        size = np.abs(np.where(observed, block, 0)).max(axis=(1, 2), keepdims=True)
-        total += np.where(observed, block / np.where(size > 0, size, 1), 0).sum(axis=0)
-        count += observed.sum(axis=0)
-    known = count > 0
-    middle = total.sum() / max(count.sum(), 1.0)
-    return np.where(known, total / np.where(known, count, 1), middle).astype(np.float32)
-
-
-def _read(source: SampleSource, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Samples of some texels; entries that a float32 cannot hold count as unobserved."""
-    block = np.asarray(source.read(rows), dtype=np.float64)
-    check_shape("samples.read(rows)", block, (len(rows), *source.shape[1:]))
-    return np.where(np.isfinite(block), block, np.nan)
-
-
 def _coupled(task: _Task, rows: NDArray[np.int64]) -> Coupled:
     """Coupled coefficients of some texels, each scaled by a power of two or more to order 1."""
-    return couple_samples(task, _unit_samples(_read(task.source, rows)))
-
-
-def _unit_samples(block: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Samples over the largest of each texel, so that float32 holds any input scale."""
-    largest = np.abs(np.where(np.isfinite(block), block, 0)).max(axis=(1, 2), keepdims=True)
-    return (block / np.where(largest > 0, largest, 1.0)).astype(np.float32)
+    return couple_samples(task, read_unit(task.source, rows))
 
 
 def couple_samples(task: _Task, block: NDArray[np.float32]) -> Coupled:
     """Fill, project and couple."""
-    return couple(task.projector.project(task.projector.fill(block, task.prior)))
+
+    def work(rows: slice) -> Coupled:
+        filled = task.projector.fill(block[rows], task.prior)
+        return couple(task.projector.project(filled))
+
+    return join_coupled(map_blocks(work, len(block), PROJECTION_BLOCK, task.n_threads))
 
 
 def _finish(
     task: _Task,
     rows: NDArray[np.int64],
     fit: TargetFit,
-    gauged: Gauged,
+    aims: _Aims,
     sharp: _Sharp | None,
 ) -> Alignment:
     """Frames of all texels: search those not in the training, refine all."""
@@ -355,15 +330,15 @@ def _finish(
     _put(found, rows, fit.found)
     trained = np.zeros(n, bool)
     trained[rows] = True
-    blocks = _blocks(task.source, np.arange(n) if sharp else np.flatnonzero(~trained))
+    blocks = blocks_of(task.source, np.arange(n) if sharp else np.flatnonzero(~trained))
     for part in track(blocks, len(blocks), "frames of all texels"):
-        samples = _unit_samples(_read(task.source, part))
+        samples = read_unit(task.source, part)
         new = ~trained[part]
         if new.any():
-            _put(found, part[new], _search(task, couple_samples(task, samples[new]), gauged))
+            _put(found, part[new], _search(task, couple_samples(task, samples[new]), aims))
         if sharp:
             _refine_block(task, part, samples, found, sharp)
-    last = sharp.regauged if sharp else gauged
+    last = sharp.regauged if sharp else aims.extended
     base_from_local = _fold_all(found.rotations, found.cluster, last)
     base_from_local[found.score == 0.0] = np.eye(3)
     return Alignment(
@@ -378,17 +353,18 @@ def _finish(
 
 
 def _search(
-    task: _Task, source: Coupled, gauged: Gauged, start: NDArray[np.float64] | None = None
+    task: _Task, source: Coupled, aims: _Aims, start: NDArray[np.float64] | None = None
 ) -> SearchResult:
-    """Search against the gauged targets, with margins; folded to the base frame."""
+    """Search and settle against the gauged targets, with margins; folded to the base frame."""
+    gauged, options = aims.extended, task.search_options
     found = search(
         source,
-        gauged.targets,
+        aims.plain,
         start=start,
-        max_tilt=task.max_tilt,
         half_turns=[symmetry.kind == "half" for symmetry in gauged.symmetries],
-        n_threads=task.n_threads,
+        **options,
     )
+    found = settle(source, gauged.targets, found, task.horizon, EXTENSIONS, options)
     folded = _fold_all(found.rotations, found.cluster, gauged)
     return replace(found, rotations=folded)
 

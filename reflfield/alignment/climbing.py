@@ -17,12 +17,15 @@ APPROACH_STEPS = 3
 # Half a coarse spacing is gone after a step this short.
 APPROACHED_STEP = 0.1
 CLIMBING_STEPS = 12
-# A step of Newton's this short leaves an error of its square: under .01 degrees.
-CONVERGED_STEP = 2e-3
+# A step of Newton's this short leaves an error of a few of its squares: .01 degrees.
+CONVERGED_STEP = 6e-3
 SHORTEST_STEP = 1e-4
 FIRST_TRUST_RADIUS = 0.25
 # Peaks that rise less than this share of the highest above the mean are given up.
-HOPEFUL = 0.75
+HOPEFUL = 0.8
+# The second-order expansion foretells the height of a peak this near.
+RELIABLE_STEP = 0.1
+EQUAL_SHARE = 1e-3
 
 
 DegreeArrays = tuple[
@@ -144,7 +147,7 @@ def ascend(
     f, trial, step = np.zeros(10), np.zeros((3, 3)), np.zeros(3)
     radius, length, value = FIRST_TRUST_RADIUS, 0.0, -np.inf
     copy_matrix(rotation, trial)
-    for n in range(n_steps + 1):
+    for _ in range(n_steps + 1):
         derivatives(trial, re, im, *tables, *scratch, f)
         if f[0] > value:
             if length > 0.9 * radius:
@@ -162,7 +165,8 @@ def ascend(
                 copy_matrix(trial, rotation)
                 found[0] = max(value, _predicted(found, step))
             break
-        if n > 0 and _predicted(found, step) < hoped:
+        if length < RELIABLE_STEP and _predicted(found, step) < hoped:
+            found[0] = _predicted(found, step)
             break
     found[10] = length
 
@@ -274,23 +278,27 @@ def climb_best(
         mine = rotations[first[i] : first[i + 1]]
         values, done = np.zeros(len(mine)), np.zeros(len(mine), np.bool_)
         complex_spectrum(series[rows[i]], low[0], re_low, im_low)
-        limits = (APPROACH_STEPS, APPROACHED_STEP, lowest_z, -np.inf)
+        mean, top = float(series[rows[i], 0]), -np.inf
         for c in range(len(mine)):
+            hoped = mean + HOPEFUL * (top - mean)
+            limits = (APPROACH_STEPS, APPROACHED_STEP, lowest_z, hoped)
             ascend(mine[c], re_low, im_low, low, scratch_low, limits, at)
             values[c] = at[0]
+            top = max(top, at[0])
         complex_spectrum(series[rows[i]], full[0], re, im)
-        mean = float(series[rows[i], 0])
-        hopes, top = values.copy(), np.max(values)
+        hopes = values.copy()
         found[i, 0] = -np.inf
         while True:
             c = _next_hopeful(hopes, done, mean, top)
             if c < 0:
                 break
             if not _already_there(mine, done, values, c):
-                limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, found[i, 0])
+                # A peak that is equal but for rounding, as symmetry makes them, is no better.
+                hoped = found[i, 0] + EQUAL_SHARE * (found[i, 0] - mean)
+                limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, hoped)
                 ascend(mine[c], re, im, full, scratch, limits, at)
                 values[c] = at[0]
-                if at[0] > found[i, 0]:
+                if at[0] > hoped:
                     found[i] = at
                     copy_matrix(mine[c], best[i])
             done[c] = True

@@ -34,6 +34,8 @@ SEEDING_TRIALS = 6
 # A function this many times brighter than the median weighs no more in the mean.
 WEIGHT_LIMIT = 4.0
 # The accumulated correlation has converged when it grows by less than this share.
+# Newton steps from the rotation of the iteration before.
+CLIMBING_STEPS = 8
 CONVERGED_GAIN = 1e-6
 MEAN_BLOCK = 256
 
@@ -89,7 +91,7 @@ def fit_targets(
     TargetFit
     """
     norms = source.norms()
-    weights = _weights(norms)
+    weights = mean_weights(norms)
     units = source.units()
     options: SearchOptions = {"max_tilt": max_tilt, "n_threads": n_threads}
     targets = seed_targets(units, weights, n_clusters, rng, options)
@@ -109,7 +111,7 @@ def fit_targets(
     return TargetFit(targets, found, np.array(history))
 
 
-def _weights(norms: NDArray[np.float64]) -> NDArray[np.float64]:
+def mean_weights(norms: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weight of each unit function in the mean: its norm, limited."""
     positive = norms[norms > 0]
     if len(positive) == 0:
@@ -125,7 +127,7 @@ def _expectation(
     if before is None or len(targets) > 1:
         found = search(units, targets, margins=False, **options)
         return found if before is None else _not_worse(units, targets, found, before, options)
-    near = _from_before(units, targets, before, options)
+    near = climb_near(units, targets, before, CLIMBING_STEPS, options)
     fell = np.flatnonzero(near.score < before.score)
     if len(fell) > 0:
         start = near.rotations[fell]
@@ -135,10 +137,31 @@ def _expectation(
     return near
 
 
-def _from_before(
-    units: Coupled, targets: Coupled, before: SearchResult, options: SearchOptions
+def climb_near(
+    units: Coupled,
+    targets: Coupled,
+    before: SearchResult,
+    n_steps: int,
+    options: SearchOptions,
 ) -> SearchResult:
-    """Climb from the earlier rotation on the series of the earlier cluster's target."""
+    """Climb from known rotations on the series of each function's own target.
+
+    Parameters
+    ----------
+    units : Coupled
+        n unit functions.
+    targets : Coupled
+        One unit function per cluster.
+    before : SearchResult
+        Of the n functions; clusters and margins stay.
+    n_steps : int
+        Newton steps at most, besides a short last one.
+    options : SearchOptions
+
+    Returns
+    -------
+    SearchResult
+    """
 
     def block(rows: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         part, labels = units[rows], before.cluster[rows]
@@ -148,7 +171,7 @@ def _from_before(
             mine = np.flatnonzero(labels == k)
             series = spectrum(part[mine], targets[k : k + 1])
             rotations[mine], at = follow(
-                series, np.arange(len(mine)), rotations[mine], 8, options["max_tilt"]
+                series, np.arange(len(mine)), rotations[mine], n_steps, options["max_tilt"]
             )
             score[mine] = at[:, 0]
         return rotations, score
@@ -166,7 +189,7 @@ def _not_worse(
     options: SearchOptions,
 ) -> SearchResult:
     """Keep the earlier cluster and rotation where the search found nothing better."""
-    near = _from_before(units, targets, before, options)
+    near = climb_near(units, targets, before, CLIMBING_STEPS, options)
     better = near.score > found.score
     for name in ("rotations", "score", "cluster"):
         getattr(found, name)[better] = getattr(near, name)[better]

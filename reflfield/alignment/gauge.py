@@ -188,8 +188,13 @@ def fix_gauge(
             turns[k] = turns[k] @ _gauge_turn(rotations[mine] @ turns[k], weights[mine], kind)
             rotations[cluster == k] = fold(rotations[cluster == k] @ turns[k], kind)
         symmetries.append(kind)
+    return Gauged(turn_targets(targets, turns), rotations, tuple(symmetries), turns)
+
+
+def turn_targets(targets: Coupled, turns: NDArray[np.float64]) -> Coupled:
+    """Targets such that frames times `turns` fit them as the frames did before."""
     blocks = rotation_blocks(np.swapaxes(turns, 1, 2), targets.n_degrees, str(targets.dtype))
-    return Gauged(rotate_coupled(targets, blocks), rotations, tuple(symmetries), turns)
+    return rotate_coupled(targets, blocks)
 
 
 def _normal_first(target: Coupled) -> NDArray[np.float64]:

@@ -324,7 +324,7 @@ def rotate_coupled(coupled: Coupled, blocks: NDArray[np.floating]) -> Coupled:
     Parameters
     ----------
     coupled : Coupled
-        n functions.
+        n functions, or one that all rotations turn.
     blocks : (n, ...) or (1, ...) float
         `reflfield.sphere.wigner.rotation_blocks` with ``degree_limit = coupled.n_degrees``.
 
@@ -335,7 +335,11 @@ def rotate_coupled(coupled: Coupled, blocks: NDArray[np.floating]) -> Coupled:
     turned, offset = [], 0
     for j, block in enumerate(coupled.blocks):
         size = 2 * j + 1
-        delta = blocks[:, offset : offset + size * size].reshape(-1, size, size)
-        turned.append(np.matmul(delta.astype(block.dtype), block))
+        delta = blocks[:, offset : offset + size * size].astype(block.dtype)
+        if len(block) == 1:
+            product = delta.reshape(-1, size) @ block[0]
+            turned.append(product.reshape(len(delta), size, -1))
+        else:
+            turned.append(np.matmul(delta.reshape(-1, size, size), block))
         offset += size * size
     return Coupled(coupled.band_limits, tuple(turned))

@@ -247,6 +247,15 @@ class Projector:
         right = light.synthesis.astype(coefficients.dtype)
         return np.matmul(np.matmul(left, coefficients), right.T)
 
+    def round_trips(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients of the samples of each coefficient: (L**2, L**2) of view and light.
+
+        Not the identity: samples below the horizon count as zero.
+        """
+        view: DirectionOperator = self._view  # type: ignore[attr-defined]
+        light: DirectionOperator = self._light  # type: ignore[attr-defined]
+        return view.analysis @ view.synthesis, light.analysis @ light.synthesis
+
     def fill(
         self,
         samples: NDArray[np.floating],

@@ -116,7 +116,7 @@ def test_blocks_from_a_source_give_the_same_as_an_array(relief, monkeypatch):
             return samples[rows]
 
     monkeypatch.setattr("reflfield.alignment.aligning.TRAINING_TEXELS", 60)
-    monkeypatch.setattr("reflfield.alignment.aligning.BLOCK_BYTES", samples[0].nbytes * 7)
+    monkeypatch.setattr("reflfield.alignment.samples.BLOCK_BYTES", samples[0].nbytes * 7)
     one = align(samples, directions, directions, iterations=2)
     two = align(Disk(), directions, directions, iterations=2, n_threads=2)
     assert np.array_equal(one.local_from_base, two.local_from_base)
