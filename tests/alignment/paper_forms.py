@@ -11,14 +11,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
+import numba  # without its cache: this file is imported under more than one name
 import numpy as np
 import scipy.fft
 
+from reflfield.alignment.correlation import spectrum
 from reflfield.sphere.hemisphere import first_tap, square_from_xyz
 from reflfield.sphere.rotations import matrix_from_euler
 from reflfield.sphere.wigner import block_offsets, rotation_blocks, wigner_d
 
+# Rotations of the exact series worked on at once: their Wigner matrices take 0.3 GB at L = 16.
+SERIES_AT_ONCE = 2048
 # Rotations and ABRDFs worked on at once: both factors of the product stay in the cache.
 ROTATIONS_AT_ONCE = 256
 ABRDFS_AT_ONCE = 32
@@ -141,7 +144,7 @@ def separated_correlations(a, b, kernel, n_threads=1):
     return cube.reshape(n, -1)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(nogil=True)
 def sampled_correlations(samples, directions, nodes, side, rotations):
     """Eq. 5: sum over directions of a(w) b(R^T w), b bilinear on hemisphere nodes, 0 below."""
     out = np.zeros(len(rotations))
@@ -238,6 +241,25 @@ def factored_maxima(view, light, target):
     return index
 
 
+def exact_maxima(source, target, rotations):
+    """Index of the highest of some rotations by the exact series: no coarse step, no climb.
+
+    Parameters
+    ----------
+    source, target : reflfield.sphere.coupling.Coupled
+        n functions and one.
+    """
+    series = spectrum(source, target)
+    best = np.full(len(series), -np.inf)
+    index = np.zeros(len(series), np.int64)
+    for some in parts(len(rotations), SERIES_AT_ONCE):
+        values = series @ rotation_blocks(rotations[some], target.n_degrees, "float32").T
+        top = values.max(axis=1)
+        index = np.where(top > best, some.start + values.argmax(axis=1), index)
+        best = np.maximum(best, top)
+    return index
+
+
 def direct_abrdf_correlations(a, b, rotations):
     """Eq. 10: (n_rotations,) sums of a * (D b D^T), Wigner-D made anew for each rotation."""
     values = [
@@ -259,7 +281,7 @@ def turned_both(b, rotations, dtype):
     return left
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(nogil=True, fastmath=True)
 def sampled_abrdf_correlations(samples, directions, nodes, side, rotations):
     """Eq. 3: sum over views and lights of a(v, l) b(R^T v, R^T l); b is 0 below the horizon.
 
@@ -293,7 +315,7 @@ def sampled_abrdf_correlations(samples, directions, nodes, side, rotations):
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(nogil=True)
 def place_all(directions, rotation, side, node, s, t):
     """First node and shares of R^T w for each direction; node -1 below the horizon."""
     for k in range(len(directions)):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from reflfield.sphere.coupling import couple
 from reflfield.sphere.harmonics import real_harmonics
 from reflfield.sphere.hemisphere import HemisphereGrid
 
@@ -63,6 +64,16 @@ def test_highest_of_the_grid_is_found_over_all_its_parts(abrdfs, grid, paper_for
     values = [paper_forms.factored_correlations(view, light, target, p) for p in range(n_parts)]
     expected = np.concatenate(values, axis=1).argmax(axis=1)
     assert np.array_equal(paper_forms.factored_maxima(view, light, target), expected)
+
+
+def test_exact_series_has_its_maximum_where_the_direct_sum_has(
+    abrdfs, grid, paper_forms, monkeypatch
+):
+    monkeypatch.setattr(paper_forms, "SERIES_AT_ONCE", 100)
+    source = couple(abrdfs.astype(np.float32))
+    found = paper_forms.exact_maxima(source, source[1:], grid)
+    sums = [paper_forms.direct_abrdf_correlations(one, abrdfs[1], grid) for one in abrdfs]
+    assert np.array_equal(found, [values.argmax() for values in sums])
 
 
 @pytest.mark.reference
