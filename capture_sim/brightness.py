@@ -92,11 +92,8 @@ def measured(scene: Scene, tracer: RayTracer) -> Scene:
     Returns
     -------
     Scene
-        With `brightness` and ``effects.active`` set. Where the choice is not
-        ``"auto"`` nothing depends on brightness and none is measured.
+        With `brightness` and ``effects.active`` set.
     """
-    if scene.effects.simulate != "auto":
-        return decided(scene)
     return decided(replace(scene, brightness=_brightness(scene, tracer)))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,11 +21,12 @@ from rich.progress import (
 from rich.table import Table
 
 from capture_sim.dome import rig_presets
+from capture_sim.effects.registry import read_choice
 from capture_sim.errors import SceneError
 from capture_sim.materials import material_presets
 from capture_sim.objects import object_presets
 from capture_sim.plan import plan as make_plan
-from capture_sim.scene import load_scene, shipped_scenes
+from capture_sim.scene import Scene, load_scene, shipped_scenes
 from capture_sim.write import write_capture
 
 app = typer.Typer(
@@ -38,6 +40,23 @@ SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="A TOML file, or the name of a shipped scene.")
 ]
 
+EffectsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--effects", metavar="CHOICE", help="auto, all, none or names with commas between."
+    ),
+]
+
+
+def _loaded(scene: str, effects: str | None) -> Scene:
+    """Scene with the choice of effects of the command line, if there is one."""
+    loaded = load_scene(scene)
+    if effects is None:
+        return loaded
+    word = effects if effects in ("auto", "all", "none") else effects.split(",")
+    choice = replace(loaded.effects, simulate=read_choice("--effects", word), forced={})
+    return replace(loaded, effects=choice)
+
 
 @app.command()
 def render(
@@ -49,24 +68,30 @@ def render(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier capture in the folder.")
     ] = False,
+    effects: EffectsOption = None,
+    contributions: Annotated[
+        int,
+        typer.Option(min=0, help="Photographs to write each effect's contribution for."),
+    ] = 0,
 ) -> None:
     """Simulate a capture: photographs, silhouettes, calibration and truth."""
     with _progress_bar() as bar:
         task = bar.add_task("views", total=None)
         write_capture(
-            load_scene(scene),
+            _loaded(scene, effects),
             output,
             workers=workers,
             overwrite=overwrite,
+            n_contributions=contributions,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     _console().print(f"Wrote {output}", highlight=False, soft_wrap=True)
 
 
 @app.command()
-def plan(scene: SceneArgument) -> None:
+def plan(scene: SceneArgument, effects: EffectsOption = None) -> None:
     """Show what would be simulated, why, and its cost, without doing it."""
-    for line in make_plan(load_scene(scene)).lines():
+    for line in make_plan(_loaded(scene, effects)).lines():
         _console().print(line, highlight=False, soft_wrap=True, markup=False)
 
 

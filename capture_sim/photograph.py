@@ -56,6 +56,13 @@ class Setup:
         )
 
     @property
+    def differs(self) -> bool:
+        """True if cameras or lights are not what the capture reports."""
+        rig = self.rig
+        same = rig.cameras == rig.reported_cameras and rig.lights == rig.reported_lights
+        return not same
+
+    @property
     def reported(self) -> Scene:
         """The scene with cameras as the capture reports them and ideal lights."""
         return replace(self.scene, cameras=self.rig.reported_cameras)

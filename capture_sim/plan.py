@@ -21,6 +21,7 @@ from capture_sim.effects.registry import EFFECTS
 from capture_sim.files import write_exr
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
+from capture_sim.record import bound_text
 from capture_sim.render import ViewSamples, arriving_light, sample_view, shade
 from capture_sim.truth import write_view_truth
 
@@ -93,11 +94,11 @@ class Plan:
             f"shading      {work.n_lit / 1e6:.1f} million lit pairs of point and light",
             f"time         about {_seconds_text(self.seconds)} on one worker",
             f"size         about {self.bytes / 1e6:.1f} MB",
-            "effects",
+            "effects      name                 leaving it out    cost  why",
         ]
         return counts + [
-            f"  {'on' if effect.simulated else 'off':3}  {effect.name:18} "
-            f"{_bound_text(effect.bound):>9}  {effect.reason}"
+            f"  {'on' if effect.simulated else 'off':3}  {effect.name:20} "
+            f"{bound_text(effect.bound):>12}  {_cost_text(effect.cost):>8}  {effect.reason}"
             for effect in self.effects
         ]
 
@@ -106,8 +107,11 @@ def _seconds_text(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
-def _bound_text(bound: float) -> str:
-    return f"<= {100.0 * bound:.3g} %" if np.isfinite(bound) else "unbounded"
+def _cost_text(cost: Cost) -> str:
+    """Millions of rays, or else of other evaluations."""
+    if cost.rays:
+        return f"{cost.rays / 1e6:.1f}M rays"
+    return f"{cost.operations / 1e6:.1f}M" if cost.operations else "0"
 
 
 def plan(scene: Scene) -> Plan:

@@ -103,8 +103,9 @@ def sample_view(scene: Scene, tracer: RayTracer, camera: Table) -> ViewSamples:
     covered, edge = found.coverage, np.zeros(n_pixels, dtype=bool)
     samples = found.samples
     if per_side_at_edges > per_side:
-        near = np.flatnonzero(_near_outline(found, int(camera["w"]), step))
-        finer = _trace_pixels(tracer, camera, near, per_side_at_edges)
+        with scene.costs.measure(antialiasing.NAME):
+            near = np.flatnonzero(_near_outline(found, int(camera["w"]), step))
+            finer = _trace_pixels(tracer, camera, near, per_side_at_edges)
         covered[near], edge[near] = finer.coverage, finer.crossed(step)
         if search != per_side:
             inside = np.flatnonzero((covered > 0.0) & ~edge)
@@ -417,11 +418,14 @@ def _shaded(
     precision = scene.material.precision
     views = towards_camera(camera, points.position)
     local_views = np.einsum("nij,nj->ni", points.shading_from_world, views)
-    directions, strength = lights.arrive(points.position, points.shading_from_world, precision)
+    with scene.costs.measure(near_lights.NAME):
+        frames = points.shading_from_world
+        directions, strength = lights.arrive(points.position, frames, precision)
     cosine = directions[:, 2]
     seen = local_views[:, 2] > 0.0
     if simulated(scene, shadows):
-        lit = lit_lights(tracer, points, seen, cosine, lights, traced)
+        with scene.costs.measure(shadows.NAME):
+            lit = lit_lights(tracer, points, seen, cosine, lights, traced)
     else:
         lit = (cosine > 0.0) & seen[:, None]
     strength *= np.where(lit, cosine, 0)

@@ -7,6 +7,9 @@ mesh               the true surface, PLY with normals and texture coordinates
 views              npz per camera, for the rays through the pixels' centres
 heldout            transforms.json of unseen views under unseen lights
 abrdf              npz of surface points with their full apparent BRDFs
+effects            which effects were simulated, why, what they took and changed
+contributions      EXR per effect and photograph: with the effect less without it
+rig                cameras and lights as they were, if not as reported
 =================  ==========================================================
 """
 
@@ -37,7 +40,9 @@ Table = Mapping[str, Any]
 Arrays = dict[str, NDArray[Any]]
 
 
-def write_truth(scene: Scene, tracer: RayTracer, folder: Path, *, ideal: Scene) -> None:
+def write_truth(
+    scene: Scene, tracer: RayTracer, folder: Path, *, ideal: Scene, more: Mapping[str, str]
+) -> None:
     """Write all truth that is not per view, and the list of what there is.
 
     Parameters
@@ -51,6 +56,8 @@ def write_truth(scene: Scene, tracer: RayTracer, folder: Path, *, ideal: Scene) 
     ideal : Scene
         With cameras and lights as calibrated: held-out frames are free of the rig's
         errors, of the lens' and of the sensor's.
+    more : dict of str to str
+        Further entries of the list of what there is.
     """
     truth = folder / "truth"
     truth.mkdir(exist_ok=True)
@@ -64,7 +71,7 @@ def write_truth(scene: Scene, tracer: RayTracer, folder: Path, *, ideal: Scene) 
     if scene.truth.points:
         listing["abrdf"] = "truth/abrdf.npz"
         write_npz(truth / "abrdf.npz", apparent_brdfs(scene, tracer))
-    write_json(truth / "truth.json", listing)
+    write_json(truth / "truth.json", {**listing, **more})
 
 
 def write_view_truth(scene: Scene, tracer: RayTracer, camera: Table, folder: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.brightness import measured
+from capture_sim.contributions import contributions, some_pairs
 from capture_sim.effects import Frame, exposure_brackets, simulated
 from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
@@ -24,7 +25,9 @@ from capture_sim.files import write_exr, write_json, write_png, write_silhouette
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup, photographs, set_up
 from capture_sim.rays import RayTracer
+from capture_sim.record import write_record
 from capture_sim.render import sample_view, traced_lights
+from capture_sim.stopwatch import Stopwatch
 from capture_sim.truth import write_truth, write_view_truth
 from capture_sim.visibility import TracedLights
 
@@ -43,6 +46,7 @@ def write_capture(
     *,
     workers: int = 1,
     overwrite: bool = False,
+    n_contributions: int = 0,
     progress: Progress | None = None,
 ) -> Path:
     """Simulate a scene and write its photographs and truth.
@@ -57,6 +61,8 @@ def write_capture(
         Views rendered at the same time.
     overwrite : bool
         True to replace an earlier capture there; anything else is kept.
+    n_contributions : int
+        Photographs for which it is written what each effect contributed to them.
     progress : callable, optional
         Called with the steps done and their total number.
 
@@ -75,11 +81,21 @@ def write_capture(
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
-        _fill(scene, part, workers, progress or (lambda done, total: None))
+        # One thread traces at a time, on behalf of all.
+        tracer = RayTracer(scene.mesh, n_threads=workers)
+        setup = set_up(measured(scene, tracer))
+        report, steps = progress or _no_progress, len(scene.cameras) + 1
+        _write_views(setup, tracer, part, workers, report)
+        _write_rest(setup, tracer, part, n_contributions)
+        report(steps, steps)
         _move_into_place(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return folder
+
+
+def _no_progress(done: int, total: int) -> None:
+    """Tell nobody."""
 
 
 def check_target(folder: Path, *, overwrite: bool) -> None:
@@ -127,17 +143,16 @@ def _move_into_place(part: Path, folder: Path) -> None:
     shutil.rmtree(old)
 
 
-def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
-    # One thread traces at a time, on behalf of all.
-    tracer = RayTracer(scene.mesh, n_threads=workers)
-    setup = set_up(measured(scene, tracer))
+def _write_views(
+    setup: Setup, tracer: RayTracer, folder: Path, workers: int, progress: Progress
+) -> None:
     traced = traced_lights(setup.real, tracer)
     for name in ("photographs", "silhouettes"):
         (folder / name).mkdir()
-    steps = len(scene.cameras) + 1
+    views = range(len(setup.scene.cameras))
+    steps = len(views) + 1
     progress(0, steps)
     with ThreadPoolExecutor(workers) as pool:
-        views = range(len(scene.cameras))
         futures = [
             pool.submit(_write_view, setup, tracer, traced, view, folder) for view in views
         ]
@@ -148,9 +163,17 @@ def _fill(scene: Scene, folder: Path, workers: int, progress: Progress) -> None:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    write_truth(setup.real, tracer, folder, ideal=setup.reported)
+
+
+def _write_rest(setup: Setup, tracer: RayTracer, folder: Path, n_contributions: int) -> None:
+    """Truth that is not per view, what was simulated, and the description of all."""
+    scene = replace(setup.scene, costs=Stopwatch())  # comparing is no part of the cost
+    pairs = some_pairs(scene, n_contributions) if n_contributions else []
+    contributed = contributions(scene, tracer, pairs) if pairs else []
+    (folder / "truth").mkdir(exist_ok=True)
+    more = write_record(setup, contributed, folder)
+    write_truth(setup.real, tracer, folder, ideal=setup.reported, more=more)
     write_json(folder / CAPTURE_FILE, capture_description(setup))
-    progress(steps, steps)
 
 
 def _write_view(

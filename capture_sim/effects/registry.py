@@ -71,10 +71,17 @@ def decided(scene: Scene) -> Scene:
     Returns
     -------
     Scene
-        With ``effects.active`` set.
+        With ``effects.active`` set, and default parameters of effects that are on
+        though the scene has no table of theirs.
     """
-    active = frozenset(effect.NAME for effect in EFFECTS if simulated(scene, effect))
-    return replace(scene, effects=replace(scene.effects, active=active))
+    active = [effect for effect in EFFECTS if simulated(scene, effect)]
+    bare = [e for e in active if scene.effects.declared(e.Options) is None]
+    choice = replace(
+        scene.effects,
+        active=frozenset(effect.NAME for effect in active),
+        parameters=(*scene.effects.parameters, *(effect.Options() for effect in bare)),
+    )
+    return replace(scene, effects=choice)
 
 
 def read_effects(value: object) -> EffectOptions:

@@ -95,3 +95,19 @@ def test_places_that_cannot_be_written_end_with_status_2(run, tiny):
     assert status == 2
     assert "tiny.toml" in err
     assert "Traceback" not in err
+
+
+def test_effects_are_chosen_on_the_command_line(run, tiny, tmp_path):
+    status, out, _ = run("plan", tiny, "--effects", "vignetting,bayer")
+    assert status == 0
+    on = {line.split()[1] for line in out.splitlines() if line.startswith("  on ")}
+    assert on == {"vignetting", "bayer"}
+    folder = tmp_path / "out"
+    run("render", tiny, "-o", folder, "--effects", "vignetting", "--contributions", 1)
+    assert [p.name for p in (folder / "truth" / "contributions").iterdir()] == ["vignetting"]
+
+
+def test_unknown_effects_on_the_command_line_are_named(run, tiny):
+    status, _, err = run("plan", tiny, "--effects", "glow")
+    assert status == 2
+    assert "--effects: expected names among" in err

@@ -10,7 +10,7 @@ from capture_sim.scene import parse_scene
 from capture_sim.write import write_capture
 
 
-def scene(thing):
+def scene(thing, **more):
     return parse_scene(
         {
             "name": "trial",
@@ -19,6 +19,7 @@ def scene(thing):
             "cameras": {"preset": "fibonacci", "n": 4, "width": 24, "height": 24},
             "lights": {"preset": "fibonacci", "n": 3},
             "truth": {"points": 10},
+            **more,
         }
     )
 
@@ -54,5 +55,14 @@ def test_size_is_near_that_of_the_capture(tmp_path):
 def test_lines_state_effects_and_reasons():
     text = " ".join("\n".join(plan(scene("vase")).lines()).split())
     assert "12 (4 views, 3 lights)" in text
-    assert re.search(r"on shadows <= \d+ % the object is not convex", text)
-    assert "off interreflection <= 0 % not simulated" in text
+    assert re.search(r"on shadows <= \d+ % \S+ rays the object is not convex", text)
+    assert "off interreflection 0 0 not simulated" in text
+
+
+def test_effects_that_are_asked_for_without_parameters_take_the_usual_ones():
+    asked = scene("sphere", effects=["vignetting", "light_variation"])
+    lines = {effect.name: effect for effect in plan(asked).effects}
+    assert lines["vignetting"].simulated
+    assert lines["vignetting"].bound > 0.01
+    assert "of the light is lost" in lines["vignetting"].reason
+    assert not lines["defocus"].simulated

@@ -66,6 +66,7 @@ def test_all_files_are_there(capture):
             "truth/mesh.ply",
             "truth/abrdf.npz",
             "truth/heldout.json",
+            "truth/effects.json",
         ]
         + [f"photographs/v{v:03d}_l{l:03d}.exr" for v in range(3) for l in range(3)]  # noqa: E741
         + [f"silhouettes/v{v:03d}.png" for v in range(3)]
@@ -85,9 +86,8 @@ def test_description_follows_the_schema(capture):
 
 def test_bytes_do_not_depend_on_the_workers(capture, tmp_path):
     again = write_capture(scene(), tmp_path / "again", workers=3)
-    same, different, missing = filecmp.cmpfiles(
-        capture, again, files_of(capture), shallow=False
-    )
+    files = [name for name in files_of(capture) if name != "truth/effects.json"]  # times
+    same, different, missing = filecmp.cmpfiles(capture, again, files, shallow=False)
     assert (different, missing) == ([], [])
     assert len(same) == 24
 
@@ -208,3 +208,85 @@ def test_bracketed_exposures_merge_to_the_linear_photograph(tmp_path):
     # Half a step of 1/255 near the dark end of a useful exposure is 2 % of its value;
     # the darkest value that the longest exposure tells from black is 1.5e-4.
     np.testing.assert_allclose(merged, expected, rtol=0.03, atol=2e-4)
+
+
+@pytest.fixture(scope="module")
+def erring(tmp_path_factory):
+    """Capture of a rig that errs, with what each effect contributed to two photographs."""
+    tables = {
+        "pose_error": {},
+        "light_variation": {},
+        "dropped_photographs": {"fraction": 0.3},
+        "quantisation": {"bits": 6},
+    }
+    folder = tmp_path_factory.mktemp("captures") / "erring"
+    plain = {"heldout": {"frames": 1}, "truth": {"points": 0, "per_view": False}}
+    return write_capture(scene(effects=tables, **plain), folder, n_contributions=2)
+
+
+def test_the_plan_is_kept_with_what_it_took(erring):
+    record = json.loads((erring / "truth" / "effects.json").read_text())
+    assert record["simulate"] == "auto"
+    lines = {line["name"]: line for line in record["effects"]}
+    on = {name for name, line in lines.items() if line["on"]}
+    assert on >= {"pose_error", "light_variation", "quantisation", "shadows", "near_lights"}
+    assert "defocus" not in on
+    for name in ("quantisation", "shadows", "near_lights", "antialiasing"):
+        assert lines[name]["seconds"] > 0.0, name
+    for name in on - {"dropped_photographs"}:
+        bound = lines[name]["bound"]
+        assert lines[name]["threshold"] < lines[name]["contribution"], name
+        assert bound is None or lines[name]["contribution"] <= bound, name
+    assert lines["defocus"]["seconds"] == 0.0
+
+
+def test_differences_of_each_effect_are_written_on_demand(erring, capture):
+    difference = read_exr(erring / "truth" / "contributions" / "quantisation" / "v000_l000.exr")
+    assert difference.shape == (20, 24, 3)
+    step = 4.0 / 63
+    assert 0.0 < np.abs(difference).max() <= step / 2 * 1.01  # half floats round
+    assert not (capture / "truth" / "contributions").exists()
+
+
+def test_missing_photographs_are_neither_written_nor_listed(erring):
+    listed = json.loads((erring / "capture.json").read_text())["photographs"]
+    assert isinstance(listed, list)
+    assert 0 < len(listed) < 9
+    assert {entry["file"] for entry in listed} == {
+        str(path.relative_to(erring)) for path in (erring / "photographs").iterdir()
+    }
+
+
+def test_the_real_rig_is_kept_beside_the_reported_one(erring, capture):
+    reported = json.loads((erring / "capture.json").read_text())
+    real = json.loads((erring / "truth" / "rig.json").read_text())
+    assert real["cameras"][0]["id"] == reported["cameras"][0]["id"]
+    assert (
+        real["cameras"][0]["camera_from_world"] != reported["cameras"][0]["camera_from_world"]
+    )
+    assert real["lights"][0]["intensity"] != reported["lights"][0]["intensity"]
+    ideal = json.loads((capture / "capture.json").read_text())
+    assert reported["cameras"] == ideal["cameras"]
+    assert not (capture / "truth" / "rig.json").exists()
+
+
+def test_held_out_frames_are_free_of_errors(erring, capture):
+    ours = read_exr(erring / "truth" / "heldout" / "h000.exr")
+    np.testing.assert_array_equal(ours, read_exr(capture / "truth" / "heldout" / "h000.exr"))
+
+
+def test_calibrated_distortion_reaches_the_reader(tmp_path):
+    from reflfield.capture.readers import open_capture
+
+    bent = scene(
+        effects={"lens_distortion": {"k1": -0.3, "k2": 0.1, "p1": 1e-3}},
+        heldout={"frames": 0},
+        truth={"points": 0},
+    )
+    folder = write_capture(bent, tmp_path / "bent")
+    read = open_capture(folder)
+    truth = np.load(folder / "truth" / "views" / "v001.npz")
+    row, column = np.nonzero(truth["label"] >= 0)
+    pixels, _ = read.cameras[1].project(truth["position"][row, column].astype(float))
+    centres = np.stack([column, row], axis=1) + 0.5
+    np.testing.assert_allclose(pixels, centres, atol=1e-3)  # float32 positions
