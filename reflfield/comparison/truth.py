@@ -293,6 +293,30 @@ def surface_points(
     return SurfacePoints(position, normal, tangent, label)
 
 
+@dataclass(frozen=True)
+class FreeTurn:
+    r"""Turn about the normal that the reflectance leaves open, taken out of the tangents.
+
+    A target's own tangent is a choice: turned together with all of its frames it explains
+    the samples as well. So for every target, and every material that it serves, the turn
+    :math:`\frac12 \arg \sum_i e^{2 i \varphi_i}` is removed, :math:`\varphi_i` being the angle
+    from the true to the recovered tangent; doubled, as half a turn changes nothing.
+
+    Attributes
+    ----------
+    target, label : int
+        Target of the alignment, and true material.
+    degrees : float
+        -90 to 90.
+    n_texels : int
+    """
+
+    target: int
+    label: int
+    degrees: float
+    n_texels: int
+
+
 @dataclass(frozen=True, eq=False)
 class FrameErrors:
     """Angles between recovered and true frames, degrees.
@@ -304,14 +328,26 @@ class FrameErrors:
     normal, tangent : (n_matched,) float64
         Angle between normals, and between the *lines* of the tangents: turning
         a tangent by 180 degrees does not change an anisotropic reflectance.
+        One turn about the normal is free for each target and material, and removed.
     label : (n_matched,) int64
         Material of the matched surface point.
+    turns : tuple of FreeTurn
+        What was removed; empty if no targets were named.
     """
 
     texel: NDArray[np.int64]
     normal: Array
     tangent: Array
     label: NDArray[np.int64]
+    turns: tuple[FreeTurn, ...] = ()
+
+    def of_material(self, label: int) -> FrameErrors:
+        """Errors of the texels of one material."""
+        mine = self.label == label
+        turns = tuple(turn for turn in self.turns if turn.label == label)
+        return FrameErrors(
+            self.texel[mine], self.normal[mine], self.tangent[mine], self.label[mine], turns
+        )
 
     def summary(self) -> dict[str, float]:
         """Mean, median and 95th percentile of both angles, degrees, and the count."""
@@ -329,6 +365,7 @@ def frame_errors(
     local_from_world: ArrayLike,
     surface: SurfacePoints,
     max_distance: float,
+    targets: ArrayLike | None = None,
 ) -> FrameErrors:
     """Angles of texel frames to the true shading frames nearest to them.
 
@@ -345,6 +382,9 @@ def frame_errors(
     max_distance : float
         Texels farther than this from any true point are left out, metres: where
         the hull bridges a hollow, no texel shows one point of the surface.
+    targets : (n_texels,) array_like of int, optional
+        Target that each texel was aligned to: one turn about the normal is removed for
+        each of them and each material, see `FreeTurn`. None removes nothing.
 
     Returns
     -------
@@ -377,14 +417,51 @@ def frame_errors(
     tree = cKDTree(surface.position)
     distance, nearest = tree.query(texels)
     usable = (distance <= max_distance) & np.isfinite(frames).all(axis=(1, 2))
-    matched, normals, tangents = np.flatnonzero(usable), [np.zeros(0)], [np.zeros(0)]
+    matched, found = np.flatnonzero(usable), frames[usable]
+    true = [(np.zeros((0, 3)), np.zeros((0, 3)))]
     for first in range(0, len(matched), TEXELS_PER_BLOCK):
         block = matched[first : first + TEXELS_PER_BLOCK]
-        normal, tangent = _interpolated_frames(tree, surface, texels[block])
-        normals.append(angle_deg(frames[block, 2], normal))
-        tangents.append(_line_angle_deg(frames[block, 0], tangent))
+        true.append(_interpolated_frames(tree, surface, texels[block]))
+    normal, tangent = (np.concatenate(part) for part in zip(*true, strict=True))
     label = surface.label[nearest[matched]]
-    return FrameErrors(matched, np.concatenate(normals), np.concatenate(tangents), label)
+    turns: tuple[FreeTurn, ...] = ()
+    own_tangent = found[:, 0]
+    if targets is not None:
+        target = np.asarray(targets)
+        check_shape("targets", target, (len(texels),))
+        turns, own_tangent = _without_free_turns(found, normal, tangent, target[matched], label)
+    return FrameErrors(
+        matched,
+        angle_deg(found[:, 2], normal),
+        _line_angle_deg(own_tangent, tangent),
+        label,
+        turns,
+    )
+
+
+def _without_free_turns(
+    frames: Array,
+    normal: Array,
+    tangent: Array,
+    target: NDArray[np.integer[Any]],
+    label: NDArray[np.int64],
+) -> tuple[tuple[FreeTurn, ...], Array]:
+    """Turns that are free, and the tangents (n, 3) without them."""
+    # The doubled angle in the plane of the true normal.
+    across = np.cross(normal, tangent)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    tangent = np.cross(across, normal)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+    along, aside = (np.einsum("nd,nd->n", frames[:, 0], axis) for axis in (tangent, across))
+    doubled = np.exp(2j * np.arctan2(aside, along))
+    turns, angle = [], np.zeros(len(frames))
+    for key in np.unique(np.stack([target, label], axis=1), axis=0):
+        mine = (target == key[0]) & (label == key[1])
+        angle[mine] = 0.5 * np.angle(doubled[mine].sum())
+        degrees = float(np.degrees(angle[mine][0]))
+        turns.append(FreeTurn(int(key[0]), int(key[1]), degrees, int(mine.sum())))
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return tuple(turns), c * frames[:, 0] - s * frames[:, 1]
 
 
 def angle_deg(a: ArrayLike, b: ArrayLike) -> Array:

@@ -126,7 +126,11 @@ def hull_score(job: Job, truth: Truth) -> HullDistance:
 def frame_scores(
     job: Job, truth: Truth, field: ReflectanceField
 ) -> tuple[FrameErrors, FrameErrors] | None:
-    """Angles of the recovered and of the base frames to the true shading frames."""
+    """Angles of the recovered and of the base frames to the true shading frames.
+
+    One turn about the normal is free for each target and material; of the base frames, which
+    have no target, for each material.
+    """
     cameras = [c.id for c in job.training.cameras if truth.has_view(c.id)]
     if not cameras:
         return None
@@ -134,9 +138,10 @@ def frame_scores(
     seen = job.seen_texels
     reach = MATCH_SPACINGS * job.texels.spacing
     position = job.texels.position[seen]
+    target = job.result("alignment", "alignment.npz")["cluster"][seen]
     return (
-        frame_errors(position, field.local_from_world[seen], surface, reach),
-        frame_errors(position, field.base_from_world[seen], surface, reach),
+        frame_errors(position, field.local_from_world[seen], surface, reach, target),
+        frame_errors(position, field.base_from_world[seen], surface, reach, 0 * target),
     )
 
 
