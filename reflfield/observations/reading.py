@@ -14,12 +14,13 @@ from reflfield.observations.resampling import (
     ResamplingOptions,
     RootedSamples,
     TexelSamples,
+    above_horizon,
     local_directions,
     resample,
     rooted_samples,
     side_for,
 )
-from reflfield.observations.store import ObservationStore
+from reflfield.observations.store import Bools, ObservationStore, Observed
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -37,6 +38,10 @@ def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
     view = 1 if capture.n_views == 1 else options.view_side or side_for(capture.n_views)
     light = 1 if n_lights == 1 else options.light_side or side_for(n_lights)
     return view, light
+
+
+# Directions of so many are worked out together to count samples.
+TEXELS_COUNTED_AT_ONCE = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,19 +109,37 @@ class TexelReader:
 
     def measured(self, texels: Indices) -> TexelSamples:
         """Samples of some texels with their directions in the world."""
-        positions = self.positions[texels]
-        views, lights = directions_of(self.capture, positions)
-        # Outside a spot's cone the sample says nothing, though no shadow falls there.
-        lit = facing_irradiance(self.capture.lights, positions).any(axis=2)
-        observed = self.store.observed
+        views, lights = directions_of(self.capture, self.positions[texels])
+        view_seen, light_seen = self._seen(texels)
         return TexelSamples(
             samples=self.store.read(texels),
             views=views,
             lights=lights,
-            view_seen=observed.views[texels],
-            light_seen=observed.lights[texels] & lit,
-            pairs=observed.pairs,
+            view_seen=view_seen,
+            light_seen=light_seen,
+            pairs=self.store.observed.pairs,
         )
+
+    def _seen(self, texels: Indices) -> tuple[Bools, Bools]:
+        """Views and lights of which some texels have samples that say something."""
+        observed = self.store.observed
+        # Outside a spot's cone the sample says nothing, though no shadow falls there.
+        lit = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
+        return observed.views[texels], observed.lights[texels] & lit
+
+    def count_fitted(self, texels: Indices) -> int:
+        """Samples of some texels that count in the reader's frames; none is read."""
+        total = 0
+        for first in range(0, len(texels), TEXELS_COUNTED_AT_ONCE):
+            some = texels[first : first + TEXELS_COUNTED_AT_ONCE]
+            frames = self.local_from_world[some]
+            view, light = (
+                local_directions(frames, directions)
+                for directions in directions_of(self.capture, self.positions[some])
+            )
+            counts = above_horizon(*self._seen(some), view, light, self.sides)
+            total += Observed(*counts, self.store.observed.pairs).count()
+        return total
 
     def rooted(self, texels: Indices) -> RootedSamples:
         """Samples (in the domain), taps and weights of some texels."""

@@ -266,14 +266,12 @@ def rooted_samples(
     """
     view = local_directions(local_from_world, texels.views)
     light = local_directions(local_from_world, texels.lights)
+    view_seen, light_seen = above_horizon(
+        texels.view_seen, texels.light_seen, view, light, sides
+    )
     cosine = np.ones(light.shape[:2], np.float32)
-    light_seen = texels.light_seen
     if sides[1] > 1:
         cosine = softened_cosine(light[..., 2]).astype(np.float32)
-        light_seen = light_seen & (light[..., 2] > -0.5 * HORIZON_SOFTNESS)
-    view_seen = texels.view_seen
-    if sides[0] > 1:
-        view_seen = view_seen & (view[..., 2] > LOWEST_VIEW)
     safe = np.where(light_seen, cosine, np.float32(1.0))
     ratio = texels.samples.astype(np.float32) / safe[:, None, :, None]
     return RootedSamples(
@@ -284,6 +282,30 @@ def rooted_samples(
         light_weights=light_seen * safe ** np.float32(2.0 / POWERS[domain]),
         pairs=texels.pairs.astype(np.float32),
     )
+
+
+def above_horizon(
+    view_seen: Bools, light_seen: Bools, view: Floats, light: Floats, sides: tuple[int, int]
+) -> tuple[Bools, Bools]:
+    """Which seen views and lights count in the texels' frames; see `rooted_samples`.
+
+    Parameters
+    ----------
+    view_seen, light_seen : (n, k) bool
+    view, light : (n, k, 3) float
+        Directions in the texels' frames.
+    sides : (int, int)
+        1 for a direction that does not vary.
+
+    Returns
+    -------
+    view_counts, light_counts : (n, k) bool
+    """
+    if sides[0] > 1:
+        view_seen = view_seen & (view[..., 2] > LOWEST_VIEW)
+    if sides[1] > 1:
+        light_seen = light_seen & (light[..., 2] > -0.5 * HORIZON_SOFTNESS)
+    return view_seen, light_seen
 
 
 def direction_taps(directions: Floats, side: int) -> tuple[NDArray[np.int32], Floats]:

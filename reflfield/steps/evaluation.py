@@ -105,9 +105,14 @@ def relit_pairs(job: Job, variant: str = MAIN) -> dict[str, RelitPairs]:
     return {name: RelitPairs(frames, root / name) for name, frames in frame_sets(job).items()}
 
 
+def metrics_path(job: Job, name: str) -> Path:
+    """File of the metrics of one set of frames, relit from the field."""
+    return job.stages.root / "comparison" / MAIN / f"{name}.json"
+
+
 def stored_comparison(job: Job, name: str) -> dict[str, Any] | None:
     """Metrics that the comparison stage has written."""
-    path = job.stages.root / "comparison" / MAIN / f"{name}.json"
+    path = metrics_path(job, name)
     return json.loads(path.read_text()) if path.is_file() else None
 
 

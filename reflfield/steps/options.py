@@ -90,7 +90,10 @@ class AlignmentOptions:
         target for all serves better: with 30 x 30 photographs of the demo, 1, 2 and 4
         clusters give 26.3, 24.9 and 24.3 dB on held-out frames (23.3 without alignment).
     refine : bool
-        Refine the frames on the samples after the harmonic search.
+        Refine the frames on the raw samples after the harmonic search on completed ones.
+    spread_deg : float
+        Standard deviation about each axis that the harmonic frames are taken to have: how
+        far the raw samples may move them.
     max_tilt_deg : float
         Largest tilt of a normal from the base surface's.
     least_margin : float
@@ -102,6 +105,7 @@ class AlignmentOptions:
     iterations: int = 4
     n_clusters: int = 1
     refine: bool = False
+    spread_deg: float = 1.0
     max_tilt_deg: float = 45.0
     least_margin: float = 0.0
 
@@ -111,6 +115,8 @@ class AlignmentOptions:
                 raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
         if not 0 < self.max_tilt_deg <= 180:
             raise InputError(f"max_tilt_deg: expected (0, 180], received {self.max_tilt_deg}")
+        if not self.spread_deg > 0:
+            raise InputError(f"spread_deg: expected > 0, received {self.spread_deg}")
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from reflfield.field.model import ReflectanceField
 from reflfield.geometry.visibility import RayScene
 from reflfield.stages import plain, replacing, versions
 from reflfield.steps import evaluation
+from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
 from reflfield.steps.standalone import metrics_text
 
@@ -143,6 +144,7 @@ def report_content(
         _alignment_section(job),
         *_truth_sections(job, field, compared.get("truth")),
         _compression_section(job),
+        sections.accounts_section(list(accounts_of(job))),
         sections.stages_section([_stage(record) for record in job.stages.records]),
         sections.run_section(plain(job.options), versions()),
     ]

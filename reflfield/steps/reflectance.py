@@ -10,7 +10,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment import Alignment, align
+from reflfield.alignment import Alignment, RefinementOptions, align
+from reflfield.alignment.refinement import SampleSet
+from reflfield.alignment.scattered import refine_scattered
 from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
 from reflfield.factorization.inference import infer_coefficients
@@ -36,6 +38,9 @@ from reflfield.steps.options import AlignmentOptions
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
+
+# On raw samples: a few rounds, the targets on texels enough for grids of this side.
+REFINEMENT = RefinementOptions(side=25, rounds=4, texels_per_cluster=8192)
 
 
 def write_observations(job: Job, folder: Path) -> dict[str, Any]:
@@ -183,18 +188,24 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
         "margin": np.zeros(n),
         "history": np.zeros(0),
     }
+    keep = np.zeros(len(job.seen_texels), bool)
     if job.options.alignment.enabled and max(job.sides) > 1:
         found = aligned(job)
         seen = job.seen_texels
         keep = found.margin >= job.options.alignment.least_margin
-        frames[seen[keep]] = found.local_from_base[keep]
+        local_from_base = found.local_from_base
+        if job.options.alignment.refine:
+            local_from_base = refined(job, found)
+        frames[seen[keep]] = local_from_base[keep]
         for name in ("cluster", "score", "margin"):
             arrays[name][seen] = getattr(found, name)
         arrays["history"] = found.history
     np.savez(folder / "alignment.npz", local_from_base=frames, **arrays)
+    n_aligned = int(keep.sum())
     moved = np.degrees(np.arccos(np.clip(frames[:, 2, 2], -1, 1)))
     return {
-        "texels aligned": len(job.seen_texels),
+        "texels aligned": n_aligned,
+        "texels that keep the base frame": len(job.seen_texels) - n_aligned,
         "mean tilt from the base normal, degrees": float(moved[job.seen_texels].mean()),
         "rotation determined (margin > .01)": int((arrays["margin"] > 0.01).sum()),
     }
@@ -220,9 +231,62 @@ def aligned(job: Job) -> Alignment:
         band_limit=(limits[0], limits[1]),
         iterations=options.iterations,
         n_clusters=options.n_clusters,
-        refine=options.refine,
+        refine=False,
         seed=job.options.seed,
         max_tilt=np.radians(options.max_tilt_deg),
+        n_threads=job.resources.workers,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RawLuminance:
+    """Raw samples of some texels in their base frames, as the refinement takes them.
+
+    Parameters
+    ----------
+    reader : TexelReader
+        Of the base frames.
+    texels : (n,) int
+    block_bytes : int
+        Working memory; the frames do not depend on it.
+    """
+
+    reader: TexelReader
+    texels: Indices
+    block_bytes: int
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(n_texels, n_views, n_lights); 1 for directions that do not vary."""
+        counts = (self.reader.capture.n_views, self.reader.capture.n_lights)
+        views, lights = (
+            1 if side == 1 else count
+            for side, count in zip(self.reader.sides, counts, strict=True)
+        )
+        return len(self.texels), views, lights
+
+    def read(self, rows: NDArray[np.int64]) -> SampleSet:
+        """Samples of some texels, read some at a time."""
+        step = max(1, self.block_bytes // self.reader.sample_bytes_per_texel)
+        parts = [
+            self.reader.luminance(self.texels[rows[first : first + step]])
+            for first in range(0, len(rows), step)
+        ]
+        return SampleSet(
+            samples=np.concatenate([part.samples for part in parts]),
+            views=np.concatenate([part.views for part in parts]),
+            lights=np.concatenate([part.lights for part in parts]),
+        )
+
+
+def refined(job: Job, found: Alignment) -> NDArray[np.float64]:
+    """Frames of the texels that have samples, refined on these."""
+    return refine_scattered(
+        RawLuminance(job.base_reader, job.seen_texels, job.resources.block_bytes),
+        found.local_from_base,
+        found.cluster,
+        replace(REFINEMENT, spread=np.radians(job.options.alignment.spread_deg)),
+        seed=job.options.seed,
         n_threads=job.resources.workers,
     )
 
@@ -257,7 +321,11 @@ def write_compressed(
     size = (folder / "field.rfld").stat().st_size
     raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
     error = sample_error(made, job.base_reader, job.seen_texels)
+    n_fitted = len(job.seen_texels)
     return {
+        "texels fitted": n_fitted,
+        "texels that repeat another": made.n_texels - n_fitted,
+        "samples fitted": job.base_reader.rotated(frames).count_fitted(job.seen_texels),
         "clusters": made.n_clusters,
         "components": made.n_components,
         "field bytes": size,

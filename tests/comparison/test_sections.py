@@ -168,3 +168,15 @@ def test_histogram_counts_everything_in_percent():
     picture = plots.histogram({"a": [0.1, 0.2, 0.3, 9.0, np.nan]}, "x", "y", limits=(0, 1))
     assert picture.is_plot
     assert (picture.width, picture.height) == (538, 298)
+
+
+def test_accounts_that_do_not_add_up_are_said():
+    whole = sections.Account("capture", "photographs", 5, {"used": 3, "held out": 2})
+    lost = sections.Account("alignment", "texels", 9, {"frame found": 7})
+    section = sections.accounts_section([whole, lost])
+    notes = [item for item in section.items if isinstance(item, Note)]
+    assert [note.text for note in notes if note.is_warning] == [
+        "alignment: 2 of 9 texels are not accounted for."
+    ]
+    assert ("", "", "not accounted for", 2) in tables(section)[0].rows
+    assert len(sections.accounts_section([whole]).items) == 1

@@ -5,6 +5,7 @@ leaves out those whose input a run does not have.
 """
 
 from reflfield.comparison.sections.ablation import FieldVariant, ablation_section
+from reflfield.comparison.sections.accounts import Account, accounts_section
 from reflfield.comparison.sections.frames import (
     alignment_section,
     comparisons_table,
@@ -28,10 +29,12 @@ from reflfield.comparison.sections.surface import (
 from reflfield.comparison.sections.truth import truth_section
 
 __all__ = [
+    "Account",
     "FieldVariant",
     "SilhouetteView",
     "StageRecord",
     "ablation_section",
+    "accounts_section",
     "alignment_section",
     "atlas_section",
     "comparisons_table",

@@ -1,0 +1,128 @@
+"""Where every photograph, sample and texel of a run has gone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from reflfield.comparison.sections import Account
+from reflfield.steps import evaluation
+from reflfield.steps.job import Job
+
+
+def accounts_of(job: Job) -> Iterator[Account]:
+    """Count what went into each stage of a finished run, and what became of it.
+
+    Totals come from the capture and the texel table, parts from what the stages have
+    recorded or left: a stage that loses something does not add up.
+
+    Parameters
+    ----------
+    job : Job
+        With its stages done up to the comparison.
+
+    Yields
+    ------
+    Account
+    """
+    counts = {record.name: record.counts for record in job.stages.records}
+    yield _photographs(job, counts["observations"])
+    yield _samples(job, counts)
+    yield from _texels(job, counts)
+    yield _frames(job)
+
+
+def _photographs(job: Job, projected: dict[str, Any]) -> Account:
+    """Photographs of the capture: projected, held out, or of a held view or light alone."""
+    view = np.isin([p.camera for p in job.capture.photographs], job.held_views)
+    light = np.isin([p.light for p in job.capture.photographs], job.held_lights)
+    both = (view | (len(job.held_views) == 0)) & (light | (len(job.held_lights) == 0))
+    held = (view | light) & both
+    return Account(
+        "observations",
+        "photographs",
+        len(job.capture.photographs),
+        {
+            "projected onto the surface": projected["photographs"],
+            "held out and compared": len(job.held_frames.photographs),
+            "held out, thinned from the comparison": int(held.sum())
+            - len(job.held_frames.photographs),
+            "of a held-out view or light alone, set aside": int(((view | light) & ~both).sum()),
+        },
+    )
+
+
+def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
+    """One sample for each texel and photograph: fitted, unseen, shadowed, below the horizon."""
+    observed, pairs = job.observed, job.observed.pairs.astype(np.float32)
+    seen = observed.views.astype(np.float32) @ pairs
+    shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
+    unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
+    used = counts["compression"]["samples fitted"]
+    return Account(
+        "compression",
+        "samples",
+        len(job.texels) * len(job.training.photographs),
+        {
+            "fitted": used,
+            "texel not seen by the camera": int(unseen),
+            "texel in shadow of the surface": int(shadowed),
+            "below the horizon of the texel's frame, or outside the light's cone": counts[
+                "observations"
+            ]["samples observed"]
+            - used,
+        },
+    )
+
+
+def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
+    """Texels of the atlas through completion, alignment and compression."""
+    n = len(job.texels)
+    completed = counts["completion"]
+    unseen = completed["texels without samples"]
+    yield Account(
+        "completion",
+        "texels",
+        n,
+        {"completed": completed["texels completed"], "without samples": unseen},
+    )
+    aligned = counts["alignment"]
+    yield Account(
+        "alignment",
+        "texels",
+        n,
+        {
+            "frame found": aligned["texels aligned"],
+            "keep the base frame": aligned["texels that keep the base frame"],
+            "without samples": unseen,
+        },
+    )
+    fitted = counts["compression"]
+    yield Account(
+        "compression",
+        "texels",
+        n,
+        {
+            "fitted to their samples": fitted["texels fitted"],
+            "repeat the nearest that is": fitted["texels that repeat another"],
+        },
+    )
+
+
+def _frames(job: Job) -> Account:
+    """Frames that are compared, from the metrics that were written."""
+    sets = evaluation.frame_sets(job)
+    measured = {
+        name: len(json.loads((evaluation.metrics_path(job, name)).read_text())["frames"])
+        for name in sets
+    }
+    names = {"heldout": "held out, measured", "truth": "unseen and simulated, measured"}
+    return Account(
+        "comparison",
+        "frames",
+        sum(len(frames.photographs) for frames in sets.values()),
+        {names[name]: count for name, count in measured.items()},
+    )

@@ -1,0 +1,70 @@
+"""Every photograph, sample and texel of a run is accounted for, in equal counts."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from reflfield.capture.readers import open_capture
+from reflfield.config import HoldOut, with_tables
+from reflfield.pipeline import run
+from reflfield.steps.accounts import accounts_of
+from reflfield.steps.options import PipelineOptions
+
+
+@pytest.fixture
+def finished_job(run_copy, tiny_capture, tiny_options):
+    """The finished run, opened again: nothing is computed."""
+    options = with_tables(PipelineOptions(), tomllib.loads(tiny_options.read_text()))
+    capture = open_capture(tiny_capture)
+    job = run(capture, run_copy, options, hold_out=HoldOut(views=1, lights=1))
+    assert all(record.reused for record in job.stages.records)
+    return job
+
+
+def test_all_accounts_add_up(finished_job):
+    accounts = {(a.stage, a.things): a for a in accounts_of(finished_job)}
+    assert [account.missing for account in accounts.values()] == [0] * 6
+    photographs = accounts["observations", "photographs"]
+    assert photographs.total == 60
+    # One of ten views and one of six lights: 9 x 5 projected, the pair compared, 5 + 9 apart.
+    assert list(photographs.parts.values()) == [45, 1, 0, 14]
+    samples = accounts["compression", "samples"]
+    assert samples.total == 45 * len(finished_job.texels)
+    assert accounts["comparison", "frames"].total == 3
+
+
+def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):
+    frames = finished_job.result("alignment", "alignment.npz")["local_from_base"]
+    reader = finished_job.base_reader.rotated(
+        (frames @ finished_job.texels.local_from_world).astype(np.float32)
+    )
+    rooted = reader.rooted(finished_job.seen_texels)
+    weights = rooted.view_weights[:, :, None] * rooted.light_weights[:, None] * rooted.pairs
+    account = next(
+        a
+        for a in accounts_of(finished_job)
+        if (a.stage, a.things) == ("compression", "samples")
+    )
+    assert account.parts["fitted"] == np.count_nonzero(weights)
+
+
+@pytest.mark.parametrize(
+    ("stage", "count"),
+    [("observations", "photographs"), ("completion", "texels completed"),
+     ("alignment", "texels aligned"), ("compression", "texels fitted"),
+     ("observations", "samples observed")],
+)  # fmt: skip
+def test_a_stage_that_loses_one_is_found_out(finished_job, stage, count):
+    record = next(r for r in finished_job.stages.records if r.name == stage)
+    record.counts[count] -= 1
+    assert sum(account.missing for account in accounts_of(finished_job)) == 1
+
+
+def test_a_frame_that_was_not_measured_is_found_out(finished_job):
+    path = finished_job.stages.root / "comparison" / "field" / "truth.json"
+    metrics = json.loads(path.read_text())
+    metrics["frames"].pop()
+    path.write_text(json.dumps(metrics))
+    assert sum(account.missing for account in accounts_of(finished_job)) == 1
