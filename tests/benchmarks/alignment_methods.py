@@ -54,6 +54,7 @@ class Job:
             "band_limit": self.band_limit,
             "cores": self.n_cores,
             "ms": found.seconds / n * 1e3,
+            "cpu_ms": found.cpu_seconds / n * 1e3,
             "megabytes": found.megabytes,
         }
         print(json.dumps(row | rest), flush=True)

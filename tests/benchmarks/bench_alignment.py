@@ -14,7 +14,9 @@ ours. Peers are skipped, saying so, where they are not installed.
 
 Every group of methods runs in a process of its own that is held on one or two cores.
 Memory is resident memory at the peak of the timed runs (tables and compiled code included)
-beyond what the process held before it prepared them. Medians; the machine should be quiet.
+beyond what the process held before it prepared them. Medians of wall time and of the CPU time
+of all threads; on one core of a quiet machine the two are equal, so the ratios of one core are
+those of CPU time, and the others need a quiet machine.
 """
 
 from __future__ import annotations
@@ -57,6 +59,7 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 PEAK = 0.05
 LEAST_SHARE = 0.95
 SEARCH = "exact, searched, to the peak"
+PEERS = ("s2fft", "pysofft")
 
 
 # --- the problem --------------------------------------------------------------------------
@@ -129,8 +132,8 @@ def functions(samples, upright, directions, band_limit):
 def rows_of(path, options):
     """Measurements of all groups of methods on one problem."""
     rows = []
-    for name in ("ours", "s2fft", "pysofft", "brute"):
-        reason = missing(name) if name in ("s2fft", "pysofft") else None
+    for name in ("ours", *PEERS, "brute"):
+        reason = missing(name) if name in PEERS else None
         if reason:
             print(f"skipped: {reason}")
             continue
@@ -139,67 +142,71 @@ def rows_of(path, options):
     return rows
 
 
-def show_correlations(rows):
-    print("\nTable 1: one correlation of two functions of direction on a grid")
-    print(f"{'L':>3} cores {'method':<30}{'rotations':>10}{'ms':>10}{'error':>10}{'MB':>7}")
-    for row in sorted(rows, key=lambda row: (row["band_limit"], row["cores"], row["ms"])):
+def time_of(row):
+    """Milliseconds that ratios are made of: CPU time on one core, else wall time."""
+    return row["cpu_ms"] if row["cores"] == 1 else row["ms"]
+
+
+HEADER = f"{'L':>3} cores {'method':<30}{'ms':>10}{'CPU ms':>10}{'MB':>7}"
+
+
+def show(title, rows, more_header, more):
+    """One table, fastest first; `more` formats what only this table has."""
+    print(f"\n{title}\n{HEADER}{more_header}")
+    for row in sorted(rows, key=lambda row: (row["band_limit"], row["cores"], time_of(row))):
         print(
-            f"{row['band_limit']:>3}{row['cores']:>6} {row['method']:<30}{row['rotations']:>10}"
-            f"{row['ms']:>10.4f}{row['error']:>10.1e}{row['megabytes']:>7.0f}"
+            f"{row['band_limit']:>3}{row['cores']:>6} {row['method']:<30}{row['ms']:>10.4f}"
+            f"{row['cpu_ms']:>10.4f}{row['megabytes']:>7.0f}{more(row)}"
         )
+
+
+def show_correlations(rows):
+    show(
+        "Table 1: one correlation of two functions of direction on a grid",
+        rows,
+        f"{'rotations':>11}{'error':>10}",
+        lambda row: f"{row['rotations']:>11}{row['error']:>10.1e}",
+    )
 
 
 def show_abrdfs(rows):
-    print("\nTable 2: one ABRDF against the target; errors in degrees")
-    print(
-        f"{'L':>3} cores {'method':<30}{'ms':>10}{'per s':>9}  to the maximum: "
-        f"median{'99 %':>9}{'<= .05':>8}  to the frame{'MB':>7}"
+    show(
+        "Table 2: one ABRDF against the target; degrees to the maximum, and to the frame",
+        rows,
+        f"{'per s':>9}{'median':>9}{'99 %':>9}{'<= .05':>9}{'frame':>9}",
+        lambda row: (
+            f"{1e3 / time_of(row):>9.0f}{row['median']:>9.4f}{row['tail']:>9.3f}"
+            f"{row['at_peak']:>9.1%}{row['planted']:>9.3f}"
+        ),
     )
-    for row in sorted(rows, key=lambda row: (row["band_limit"], row["cores"], row["ms"])):
-        print(
-            f"{row['band_limit']:>3}{row['cores']:>6} {row['method']:<30}{row['ms']:>10.4f}"
-            f"{1e3 / row['ms']:>9.0f}{row['median']:>24.4f}{row['tail']:>9.3f}"
-            f"{row['at_peak']:>8.1%}{row['planted']:>14.3f}{row['megabytes']:>7.0f}"
-        )
-
-
-def show_rest(rows, searches):
-    print("\nBefore the search, and the search beside it; per ABRDF")
-    print(f"{'L':>3} cores {'step':<30}{'ms':>10}{'MB':>7}")
-    both = rows + searches
-    for row in sorted(both, key=lambda row: (row["band_limit"], row["cores"], row["method"])):
-        print(
-            f"{row['band_limit']:>3}{row['cores']:>6} {row['method']:<30}{row['ms']:>10.4f}"
-            f"{row['megabytes']:>7.0f}"
-        )
 
 
 def show_ratios(rows):
     """Exact search against Eq. 11 on the fastest peer, and two cores against one."""
-    ms = {(row["band_limit"], row["cores"], row["method"]): row["ms"] for row in rows}
+    ms = {(row["band_limit"], row["cores"], row["method"]): time_of(row) for row in rows}
     print()
     for band_limit, cores, name in sorted(ms):
         if name != SEARCH:
             continue
-        ours = ms[band_limit, cores, name]
-        key = (band_limit, cores)
+        ours = ms[band_limit, cores, SEARCH]
         for rank in sorted({row["rank"] for row in rows if "rank" in row}):
-            peers = {
-                method.split(", ")[-1]: value
-                for (*where, method), value in ms.items()
-                if tuple(where) == key
-                and method.startswith(f"Eq. 11, K={rank}")
-                and "ours" not in method
-            }
-            if peers:
-                best = min(peers, key=peers.get)
+            name, best = fastest_peer(ms, (band_limit, cores), rank)
+            if name:
                 print(
                     f"L={band_limit}, cores {cores}: exact search : Eq. 11 with K={rank} on "
-                    f"{best} = 1 : {peers[best] / ours:.2f}"
+                    f"{name} = 1 : {best / ours:.2f}"
                 )
         if (band_limit, 1, SEARCH) in ms and cores > 1:
             gain = ms[band_limit, 1, SEARCH] / ours
             print(f"L={band_limit}: search on {cores} cores = {gain:.2f} times one core")
+
+
+def fastest_peer(ms, where, rank):
+    """Name and time of the fastest peer for Eq. 11, or None twice."""
+    peers = {name: ms.get((*where, f"Eq. 11, K={rank}, {name}")) for name in PEERS}
+    present = {name: value for name, value in peers.items() if value}
+    best = min(present, key=present.get, default=None)
+    return best, present.get(best)
 
 
 def check(rows):
@@ -246,7 +253,8 @@ def main() -> None:
     tables = [[row for row in rows if row["table"] == k] for k in range(3)]
     show_correlations(tables[1])
     show_abrdfs(tables[2])
-    show_rest(tables[0], [row for row in rows if row["method"] == SEARCH])
+    searches = [row for row in rows if row["method"] == SEARCH]
+    show("Before the search, and the search beside it", tables[0] + searches, "", lambda _: "")
     show_ratios(tables[2])
     check(rows)
 

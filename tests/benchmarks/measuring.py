@@ -25,6 +25,7 @@ class Measured(NamedTuple):
 
     answer: object
     seconds: float  # median of the repeats
+    cpu_seconds: float  # of all threads together, median
     megabytes: float  # of resident memory at the peak, beyond what was held before preparing
 
 
@@ -60,25 +61,27 @@ def measured(prepare, work, repeats=5, shortest=0.05):
     before = resident()
     prepared = prepare()
     reset_peak()
-    answer, seconds = timed(lambda: work(prepared), 1)
-    times = [seconds]
-    if seconds < LONG:
-        count = max(1, int(shortest / max(seconds, 1e-9)))
+    answer, *times = timed(lambda: work(prepared), 1)
+    runs = [times]
+    if times[0] < LONG:
+        count = max(1, int(shortest / max(times[0], 1e-9)))
         # Compilers are gone by now: what remains is what the method needs to run.
         reset_peak()
-        times = []
-        while len(times) < repeats and sum(times) * count < LONG:
-            answer, seconds = timed(lambda: work(prepared), count)
-            times.append(seconds / count)
-    return Measured(answer, median(times), (peak() - before) / 2**20)
+        runs = []
+        while len(runs) < repeats and count * sum(run[0] for run in runs) < LONG:
+            answer, *times = timed(lambda: work(prepared), count)
+            runs.append(times)
+    seconds, cpu_seconds = (median(column) for column in zip(*runs, strict=True))
+    return Measured(answer, seconds, cpu_seconds, (peak() - before) / 2**20)
 
 
 def timed(work, count):
-    """Last answer and seconds of `count` runs together."""
-    start = time.perf_counter()
+    """Last answer, seconds and CPU seconds of each of `count` runs."""
+    start = time.perf_counter(), time.process_time()
     for _ in range(count):
         answer = work()
-    return answer, time.perf_counter() - start
+    end = time.perf_counter(), time.process_time()
+    return answer, *((b - a) / count for a, b in zip(start, end, strict=True))
 
 
 def on_cores(n_cores, script, *arguments):
