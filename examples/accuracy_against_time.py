@@ -12,9 +12,10 @@ On the paper's synthetic scene (section 5.1; 81 x 81 directions). Points, on one
   texels; the errors are those of all, whose maxima the exact series has at the same rotations);
 * refined: the whole of `align` with 0 to 8 rounds of refinement on the samples.
 
-The first three search against one target, found beforehand by an exact alignment; projection,
-coupling and factorisation are not in their times. The last contains everything, from samples
-to frames. Writes accuracy_against_time.png and accuracy_against_time.csv.
+The first three search once against one target, the material in its own frame; projection,
+coupling and factorisation are not in their times, and what lies below a texel's base horizon
+is dark, as in the paper. The last contains everything, from samples to frames: finding the
+target, and filling in what lies below. Writes accuracy_against_time.png and .csv.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from reflfield.alignment.climbing import follow  # noqa: E402
 from reflfield.alignment.correlation import spectrum  # noqa: E402
 from reflfield.alignment.refinement import RefinementOptions  # noqa: E402
 from reflfield.comparison.plots import SERIES_COLOURS  # noqa: E402
-from reflfield.sphere.coupling import couple, uncouple  # noqa: E402
+from reflfield.sphere.coupling import couple  # noqa: E402
 from reflfield.sphere.projection import Projector  # noqa: E402
 
 RANKS = (2, 4, 6, 8)
@@ -127,12 +128,12 @@ class Problem(NamedTuple):
 
 
 def problem(data, band_limit):
-    """Project; the target is that of an exact harmonic alignment."""
+    """Project the texels, and the material in its own frame as their target."""
     projector = Projector(data.directions, data.directions, (band_limit, band_limit))
-    found = align(data.samples, data.directions, data.directions, band_limit, refine=False)
+    upright = sample_texels(np.eye(3)[None], data.directions, data.directions)
     return Problem(
         projector.project(data.samples),
-        uncouple(found.targets)[0].astype(np.float32),
+        projector.project(upright)[0],
         band_limit,
         paper_forms.paper_grid(band_limit),
     )
@@ -309,8 +310,10 @@ def write_beside(axes, one, here):
     axes.annotate(text, here, xytext=(4, 4), textcoords="offset points", fontsize=7)
     if remark(one):
         axes.plot(*here, "o", ms=16, mfc="none", mec="black")
+        # Away from the points that follow to the right.
+        away = (-90, -4) if one.kind == "refined" else (-10, 26)
         axes.annotate(
-            remark(one), here, xytext=(-10, 26), textcoords="offset points", fontsize=9,
+            remark(one), here, xytext=away, textcoords="offset points", fontsize=9,
             ha="center", arrowprops={"arrowstyle": "-"},
         )  # fmt: skip
 
