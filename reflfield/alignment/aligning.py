@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from reflfield.alignment.expectation import TargetFit, fit_targets, mean_targets
 from reflfield.alignment.gauge import Gauged, fix_gauge, fold, turn_targets
 from reflfield.alignment.horizon import Horizon, extend_targets, settle
+from reflfield.alignment.materials import Materials, choose, one_round, spread_rows, tell_apart
 from reflfield.alignment.refinement import (
     NodeTargets,
     RefinementOptions,
     SampleSet,
-    improve_frames,
     refine_targets,
 )
 from reflfield.alignment.samples import (
@@ -178,25 +178,16 @@ def align(
     with one_core_blas():
         # Keep the coefficients of some texels, and find targets and their frames.
         training = join_coupled([_coupled(task, part) for part in blocks_of(source, rows)])
-        fit = fit_targets(
-            training,
-            n_clusters=n_clusters,
-            iterations=iterations,
-            rng=rng,
-            max_tilt=max_tilt,
-            n_threads=n_threads,
-        )
-        # What no direction of the dome shows of a tilted texel is taken from the targets.
-        extended = extend_targets(training, fit, task.horizon, EXTENSIONS, task.search_options)
-        # Give the frames a meaning, and sharpen the targets on samples.
-        start = extended.found
-        weights = np.where(training.norms() > 0, np.maximum(start.score, 0.0), 0.0)
-        gauged = fix_gauge(extended.targets, start.rotations, start.cluster, weights)
-        aims = _Aims(turn_targets(fit.targets, gauged.turns), gauged)
-        found = _search(task, training, aims, gauged.rotations)
-        fit = replace(extended, targets=gauged.targets, found=found)
         refinement = RefinementOptions() if refine is True else refine
-        sharp = _sharpen(task, rows, training, fit, refinement) if refinement else None
+        # With samples at hand, they tell materials apart better than harmonics.
+        n_targets = 1 if refinement else n_clusters
+        fit, aims = _harmonic_fit(task, training, n_targets, iterations, rng)
+        sharp = None
+        if refinement:
+            view = _RefiningView.of(task, rows, training, refinement, n_clusters)
+            if n_clusters > 1:
+                fit, aims = _divide(task, view, training, fit, n_clusters, iterations, rng)
+            sharp = _sharpen(task, view, fit)
         # Find the frames of all texels, block by block.
         return _finish(task, rows, fit, aims, sharp)
 
@@ -212,6 +203,120 @@ class _Aims:
     plain: Coupled
     extended: Gauged
 
+    def only(self, k: int) -> _Aims:
+        """Those of one cluster."""
+        every = self.extended
+        one = Gauged(
+            every.targets[k : k + 1],
+            every.rotations[:0],
+            every.symmetries[k : k + 1],
+            every.turns[k : k + 1],
+        )
+        return _Aims(self.plain[k : k + 1], one)
+
+    @classmethod
+    def joined(cls, parts: list[_Aims]) -> _Aims:
+        """Those of several clusters, in their order."""
+        every = Gauged(
+            join_coupled([part.extended.targets for part in parts]),
+            parts[0].extended.rotations[:0],
+            tuple(s for part in parts for s in part.extended.symmetries),
+            np.concatenate([part.extended.turns for part in parts]),
+        )
+        return cls(join_coupled([part.plain for part in parts]), every)
+
+
+@dataclass(frozen=True, eq=False)
+class _RefiningView:
+    """The training texels whose samples the sharp targets are fitted to.
+
+    Parameters
+    ----------
+    some : (k,) int64
+        Places among the training texels.
+    data : SampleSet
+    training : Coupled
+        Their coefficients.
+    options : RefinementOptions
+    """
+
+    some: NDArray[np.int64]
+    data: SampleSet
+    training: Coupled
+    options: RefinementOptions
+
+    @classmethod
+    def of(
+        cls,
+        task: _Task,
+        rows: NDArray[np.int64],
+        training: Coupled,
+        options: RefinementOptions,
+        n_clusters: int,
+    ) -> _RefiningView:
+        """As many as the options ask for and the memory holds, evenly spread."""
+        each = 4 * task.source.shape[1] * task.source.shape[2]
+        most = min(options.texels_per_cluster * n_clusters, max(REFINING_BYTES // each, 64))
+        some = spread_rows(len(rows), most)
+        parts = [read_unit(task.source, part) for part in blocks_of(task.source, rows[some])]
+        data = SampleSet(np.concatenate(parts), task.projector.views, task.projector.lights)
+        return cls(some, data, training[some], options)
+
+
+def _harmonic_fit(
+    task: _Task,
+    training: Coupled,
+    n_clusters: int,
+    iterations: int,
+    rng: np.random.Generator,
+) -> tuple[TargetFit, _Aims]:
+    """Targets and frames from the coefficients alone, in the gauge of the base frames."""
+    fit = fit_targets(
+        training, n_clusters=n_clusters, iterations=iterations, rng=rng, **task.search_options
+    )
+    # What no direction of the dome shows of a tilted texel is taken from the targets.
+    extended = extend_targets(training, fit, task.horizon, EXTENSIONS, task.search_options)
+    start = extended.found
+    weights = np.where(training.norms() > 0, np.maximum(start.score, 0.0), 0.0)
+    gauged = fix_gauge(extended.targets, start.rotations, start.cluster, weights)
+    aims = _Aims(turn_targets(fit.targets, gauged.turns), gauged)
+    found = _search(task, training, aims, gauged.rotations)
+    return replace(extended, targets=gauged.targets, found=found), aims
+
+
+def _divide(
+    task: _Task,
+    view: _RefiningView,
+    training: Coupled,
+    common: TargetFit,
+    n_clusters: int,
+    iterations: int,
+    rng: np.random.Generator,
+) -> tuple[TargetFit, _Aims]:
+    """Materials told apart on samples, from the frames by one target; then each by itself."""
+    frames = np.ascontiguousarray(np.swapaxes(common.found.rotations[view.some], 1, 2))
+    label = tell_apart(view.data, frames, n_clusters, view.options, rng, task.n_threads).cluster
+    used = np.unique(label)
+    found = SearchResult(
+        rotations=common.found.rotations.copy(),
+        score=common.found.score.copy(),
+        margin=common.found.margin.copy(),
+        cluster=np.zeros(len(training), np.int32),
+    )
+    parts = []
+    for k, old in enumerate(used):
+        mine = np.flatnonzero(label == old)
+        fit, aims = _harmonic_fit(task, view.training[mine], 1, iterations, rng)
+        _put(
+            found, view.some[mine], replace(fit.found, cluster=fit.found.cluster + np.int32(k))
+        )
+        parts.append(aims)
+    every = _Aims.joined(parts)
+    rest = np.setdiff1d(np.arange(len(training)), view.some)
+    if len(rest) > 0:
+        _put(found, rest, _search(task, training[rest], every))
+    return replace(common, targets=every.extended.targets, found=found), every
+
 
 @dataclass(frozen=True, eq=False)
 class _Sharp:
@@ -222,34 +327,26 @@ class _Sharp:
     regauged: Gauged
 
 
-def _sharpen(
-    task: _Task,
-    rows: NDArray[np.int64],
-    training: Coupled,
-    fit: TargetFit,
-    options: RefinementOptions,
-) -> _Sharp:
+def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit) -> _Sharp:
     """Refine some training texels, and fix the gauge again from their better frames."""
-    n_clusters = len(fit.targets)
-    each = 4 * task.source.shape[1] * task.source.shape[2]
-    most = min(options.texels_per_cluster * n_clusters, max(REFINING_BYTES // each, 64))
-    some = np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))
-    parts = [read_unit(task.source, part) for part in blocks_of(task.source, rows[some])]
-    data = SampleSet(np.concatenate(parts), task.projector.views, task.projector.lights)
-    found = fit.found
-    frames = np.ascontiguousarray(np.swapaxes(found.rotations[some], 1, 2))
-    cluster = found.cluster[some]
+    data, options, n_clusters = view.data, view.options, len(fit.targets)
+    frames = np.ascontiguousarray(np.swapaxes(fit.found.rotations[view.some], 1, 2))
+    cluster, score = fit.found.cluster[view.some], fit.found.score[view.some]
     targets, frames = refine_targets(data, frames, cluster, n_clusters, options, task.n_threads)
-    better = replace(
-        found,
-        rotations=np.ascontiguousarray(np.swapaxes(frames, 1, 2)),
-        cluster=cluster,
-        score=found.score[some],
-    )
-    weights = np.where(data.brightness() > 0, np.maximum(better.score, 0.0), 0.0)
-    means = mean_targets(training[some], weights, better, n_clusters)
-    regauged = fix_gauge(means, better.rotations, cluster, weights)
-    return _Sharp(targets, options, regauged)
+    if n_clusters > 1:
+        state = Materials(targets, frames, data.brightness(), cluster)
+        state = one_round(
+            data,
+            choose(data, state, options, options.steps, task.n_threads),
+            options,
+            task.n_threads,
+        )
+        targets, frames, cluster = state.targets, state.frames, state.cluster
+    rotations = np.ascontiguousarray(np.swapaxes(frames, 1, 2))
+    better = SearchResult(rotations, score, np.zeros(len(score)), cluster)
+    weights = np.where(data.brightness() > 0, np.maximum(score, 0.0), 0.0)
+    means = mean_targets(view.training, weights, better, n_clusters)
+    return _Sharp(targets, options, fix_gauge(means, rotations, cluster, weights))
 
 
 def _projector(
@@ -337,7 +434,7 @@ def _finish(
         if new.any():
             _put(found, part[new], _search(task, couple_samples(task, samples[new]), aims))
         if sharp:
-            _refine_block(task, part, samples, found, sharp)
+            _refine_block(task, part, samples, found, aims, sharp)
     last = sharp.regauged if sharp else aims.extended
     base_from_local = _fold_all(found.rotations, found.cluster, last)
     base_from_local[found.score == 0.0] = np.eye(3)
@@ -379,24 +476,23 @@ def _refine_block(
     part: NDArray[np.int64],
     samples: NDArray[np.float32],
     found: SearchResult,
+    aims: _Aims,
     sharp: _Sharp,
 ) -> None:
     """Refine the frames of one block against the finished targets, in place."""
     data = SampleSet(samples, task.projector.views, task.projector.lights)
     frames = np.ascontiguousarray(np.swapaxes(found.rotations[part], 1, 2))
-    cluster = found.cluster[part]
-    improve_frames(
-        data,
-        frames,
-        data.brightness(),
-        cluster,
-        sharp.targets,
-        sharp.options,
-        sharp.options.last_steps,
-        task.n_threads,
-    )
-    turns = sharp.regauged.turns[cluster]
-    found.rotations[part] = np.swapaxes(frames, 1, 2) @ turns
+    before = found.cluster[part]
+    state = Materials(sharp.targets, frames, data.brightness(), before)
+    state = choose(data, state, sharp.options, sharp.options.last_steps, task.n_threads)
+    found.cluster[part] = state.cluster
+    turns = sharp.regauged.turns[state.cluster]
+    found.rotations[part] = np.swapaxes(state.frames, 1, 2) @ turns
+    # Scores are those of the cluster that each texel ended in.
+    for k in np.unique(state.cluster[state.cluster != before]):
+        mine = (state.cluster == k) & (before != k)
+        again = _search(task, couple_samples(task, samples[mine]), aims.only(int(k)))
+        found.score[part[mine]], found.margin[part[mine]] = again.score, again.margin
 
 
 def _fold_all(
