@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from capture_sim.effects import (
 from capture_sim.effects.registry import EFFECTS
 from capture_sim.effects.sensor import exposed
 from capture_sim.model import Scene
-from capture_sim.photograph import photographs, set_up, without
+from capture_sim.photograph import photographs, set_up, toggled
 from capture_sim.rays import RayTracer
 
 Float32 = NDArray[np.float32]
@@ -74,7 +74,7 @@ def some_pairs(scene: Scene, count: int) -> list[Pair]:
 
 
 def contributions(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> list[Contribution]:
-    """What each effect that is on contributes to some photographs.
+    """What each effect that the scene describes does to some photographs.
 
     Parameters
     ----------
@@ -87,21 +87,30 @@ def contributions(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> list[Co
     Returns
     -------
     list of Contribution
-        In the order of the effects; missing photographs have none.
+        In the order of the effects. Those that are on are left out for comparison, those
+        that are off but described are added. Missing photographs have none.
     """
     everything, seconds = arriving(scene, tracer, pairs)
     found = []
     for effect in EFFECTS:
-        if not simulated(scene, effect) or effect is dropped_photographs:
+        if not _described(scene, effect) or effect is dropped_photographs:
             continue
         if effect.STAGE is Stage.SENSOR:
             found.append(_of_sensor(scene, effect, everything))
+            continue
+        other, others_seconds = arriving(toggled(scene, effect), tracer, pairs)
+        added = (seconds - others_seconds) / len(pairs)
+        if simulated(scene, effect):
+            found.append(_compared(effect, everything, other, added))
         else:
-            reduced, shorter = arriving(without(scene, effect), tracer, pairs)
-            found.append(
-                _compared(effect, everything, reduced, (seconds - shorter) / len(pairs))
-            )
+            found.append(_compared(effect, other, everything, -added))
     return found
+
+
+def _described(scene: Scene, effect: Effect) -> bool:
+    """True if the scene says enough about an effect to simulate it."""
+    in_every_scene = not fields(effect.Options) or effect.STAGE is Stage.TRANSPORT
+    return in_every_scene or scene.effects.declared(effect.Options) is not None
 
 
 def arriving(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> tuple[Images, float]:

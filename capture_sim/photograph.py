@@ -180,8 +180,8 @@ def mean_depth(view: ViewSamples) -> Float32:
     return np.asarray(mean.reshape(view.coverage.shape), np.float32)
 
 
-def without(scene: Scene, effect: Effect) -> Scene:
-    """A scene whose effects were decided, with one of them left out.
+def toggled(scene: Scene, effect: Effect) -> Scene:
+    """A scene whose effects were decided, with one of them off if on and on if off.
 
     Parameters
     ----------
@@ -193,5 +193,5 @@ def without(scene: Scene, effect: Effect) -> Scene:
     -------
     Scene
     """
-    active = (scene.effects.active or frozenset()) - {effect.NAME}
+    active = (scene.effects.active or frozenset()) ^ {effect.NAME}
     return replace(scene, effects=replace(scene.effects, active=active))

@@ -54,8 +54,9 @@ def needed(scene: Scene) -> Decision:
     dark = 0.0 if noise is None else sensor_noise.standard_deviation(noise, 0.0)
     offset = sensor_noise.SIGMAS * options.drift
     cut = max(0.0, sensor_noise.SIGMAS * dark - options.level)
+    rounding = float(np.finfo(np.float32).eps) * (scene.brightness.brightest + options.level)
     reason = f"pedestal {options.level:g}, drift {options.drift:g}"
-    return Decision(reason, (offset + cut) / scene.brightness.percentile99)
+    return Decision(reason, (offset + cut + rounding) / scene.brightness.percentile99)
 
 
 def cost(scene: Scene, work: Workload) -> Cost:

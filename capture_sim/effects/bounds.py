@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 _ARC = np.linspace(-1.2, 1.2, 97)
 _INCLINATIONS = np.radians([0.0, 30.0, 60.0])
 _N_PLACES = 24
+# Rays and BRDFs are float32: what a shift of nothing at all may change.
+RAY_ROUNDING = 16.0 * float(np.finfo(np.float32).eps)
 # Shifts below this, pixels, turn no ray from one side of an edge to the other.
 SMALLEST_SHIFT = 1e-5
 
@@ -63,7 +65,7 @@ def shift_bound(scene: Scene, pixels: float) -> float:
         Part of the frame's 99th percentile.
     """
     row = 1.0 / scene.image.samples_per_side if pixels > SMALLEST_SHIFT else 0.0
-    return scene.brightness.headroom * min(1.0, float(pixels) + row)
+    return scene.brightness.headroom * min(1.0, float(pixels) + row + RAY_ROUNDING)
 
 
 def steepness(material: Material) -> float:

@@ -233,6 +233,7 @@ def test_the_plan_is_kept_with_what_it_took(erring):
     assert "defocus" not in on
     for name in ("quantisation", "shadows", "near_lights", "antialiasing"):
         assert lines[name]["seconds"] > 0.0, name
+    assert lines["interreflection"]["on"] or lines["interreflection"]["contribution"] >= 0.0
     for name in on - {"dropped_photographs"}:
         bound = lines[name]["bound"]
         assert lines[name]["threshold"] < lines[name]["contribution"], name
