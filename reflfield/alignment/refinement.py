@@ -154,7 +154,7 @@ class NodeTargets:
 
 
 @numba.njit(cache=True, nogil=True)
-def _place(
+def place_directions(
     directions: NDArray[np.float64],
     frame: NDArray[np.float64],
     side: int,
@@ -279,8 +279,8 @@ def spread(
     for i in range(samples.shape[0]):
         if brightness[i] <= 0.0:
             continue
-        _place(views[i % len(views)], frames[i], sides[0], v_nodes, v_places)
-        _place(lights[i % len(lights)], frames[i], sides[1], l_nodes, l_places)
+        place_directions(views[i % len(views)], frames[i], sides[0], v_nodes, v_places)
+        place_directions(lights[i % len(lights)], frames[i], sides[1], l_nodes, l_places)
         for v in range(n_views):
             node = v_nodes[v]
             if node < 0:
@@ -368,7 +368,7 @@ def _add_views(
 
 
 @numba.njit(cache=True, nogil=True)
-def _hold(
+def hold(
     frame: NDArray[np.float64],
     start: NDArray[np.float64],
     strength: float,
@@ -403,7 +403,7 @@ def _factor(normal: NDArray[np.float64]) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _solve(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
+def solve_step(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
     """Damped solution of the 4x4 normal equations, limited in length; False if singular."""
     largest = max(normal[0, 0], normal[1, 1], normal[2, 2])
     if not (largest > 0.0 and normal[3, 3] > 0.0):
@@ -426,7 +426,7 @@ def _solve(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _turn_frame(
+def turn_frame(
     frame: NDArray[np.float64],
     w: NDArray[np.float64],
     turn: NDArray[np.float64],
@@ -475,8 +475,8 @@ def improve(
         for n in range(n_steps + 1):
             normal[:] = 0.0
             scale = brightness[i] * scale_factor if n > 0 else brightness[i]
-            _place(views[i % len(views)], frame, sides[0], v_nodes, v_places)
-            _place(lights[i % len(lights)], frame, sides[1], l_nodes, l_places)
+            place_directions(views[i % len(views)], frame, sides[0], v_nodes, v_places)
+            place_directions(lights[i % len(lights)], frame, sides[1], l_nodes, l_places)
             _add_views(
                 samples[i],
                 target,
@@ -489,17 +489,17 @@ def improve(
             )
             if n == 0:
                 strength = normal[4, 4] / max(normal[1, 4] - 4.0, 1.0) / (spread * spread)
-            _hold(frame, starts[i], strength, normal)
+            hold(frame, starts[i], strength, normal)
             cost = normal[4, 4] / max(normal[0, 4], 1e-300)
             if cost < least:
                 least = cost
                 copy_matrix(frame, frames[i])
                 brightness[i] = scale
-                if not _solve(normal, step):
+                if not solve_step(normal, step):
                     break
             else:
                 shrink(step, 4, 0.25)
-            _turn_frame(frames[i], step, turn, frame)
+            turn_frame(frames[i], step, turn, frame)
             scale_factor = np.exp(step[3])
 
 

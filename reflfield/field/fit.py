@@ -51,6 +51,10 @@ class SampleFitOptions:
     smoothness : float
         Weight of squared differences between neighbouring nodes against one sample at
         each node.
+    frame_spread_deg : float
+        Standard deviation about each axis that the aligned frames are taken to have: half
+        way through the rounds they are improved against the model, held by that much.
+        0 keeps them.
     max_bytes : int
         Samples of the texels that shape the basis are held in memory up to this size;
         coefficients are found for all texels, block by block.
@@ -59,6 +63,7 @@ class SampleFitOptions:
     rounds: int = 4
     iterations: int = 12
     smoothness: float = 0.05
+    frame_spread_deg: float = 1.0
     max_bytes: int = 192 << 20
 
     def __post_init__(self) -> None:
@@ -67,6 +72,21 @@ class SampleFitOptions:
                 raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
         if not self.smoothness >= 0:
             raise InputError(f"smoothness: expected >= 0, received {self.smoothness}")
+        if not self.frame_spread_deg >= 0:
+            raise InputError(
+                f"frame_spread_deg: expected >= 0, received {self.frame_spread_deg}"
+            )
+
+    def halves(self) -> tuple[SampleFitOptions, SampleFitOptions]:
+        """Rounds before and after the frames are improved, one at least of each.
+
+        Examples
+        --------
+        >>> [half.rounds for half in SampleFitOptions(rounds=5).halves()]
+        [2, 3]
+        """
+        first = max(1, self.rounds // 2)
+        return replace(self, rounds=first), replace(self, rounds=max(1, self.rounds - first))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from reflfield.factorization.inference import infer_coefficients
 from reflfield.field.compression import cluster_completed, fill_unobserved
 from reflfield.field.file import write_field
 from reflfield.field.fit import ClusteredModel, fit_samples
+from reflfield.field.frames import improved_frames
 from reflfield.field.model import (
     BaseSurface,
     FittedReflectance,
@@ -183,6 +184,7 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
     n = job.base_reader.n_texels
     frames = np.tile(np.eye(3), (n, 1, 1))
     arrays: dict[str, Any] = {
+        "aligned": np.zeros(n, bool),
         "cluster": np.zeros(n, np.int32),
         "score": np.zeros(n),
         "margin": np.zeros(n),
@@ -193,6 +195,7 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
         found = aligned(job)
         seen = job.seen_texels
         keep = found.margin >= job.options.alignment.least_margin
+        arrays["aligned"][seen[keep]] = True
         local_from_base = found.local_from_base
         if job.options.alignment.refine:
             local_from_base = refined(job, found)
@@ -298,24 +301,40 @@ def _band_limit(wanted: int, directions: NDArray[np.float64]) -> int:
 def write_compression(job: Job, folder: Path) -> dict[str, Any]:
     """Raw samples in the aligned frames -> clusters, mean, basis, coefficients -> field."""
     stored = job.result("alignment", "alignment.npz")
-    return write_compressed(job, stored["local_from_base"], plain(job.options), folder)
+    frames = AlignedFrames(stored["local_from_base"], np.flatnonzero(stored["aligned"]))
+    return write_compressed(job, frames, plain(job.options), folder)
 
 
 def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
     """The same in the base frames: as many clusters, components and bits."""
-    frames = np.tile(np.eye(3), (job.base_reader.n_texels, 1, 1))
+    base = np.tile(np.eye(3), (job.base_reader.n_texels, 1, 1))
+    frames = AlignedFrames(base, np.zeros(0, np.intp))
     made_with = plain(replace(job.options, alignment=AlignmentOptions(enabled=False)))
     del made_with["completion"]
     return write_compressed(job, frames, made_with, folder)
 
 
+@dataclass(frozen=True, eq=False)
+class AlignedFrames:
+    """Frames that a field is fitted in.
+
+    Parameters
+    ----------
+    local_from_base : (n_texels, 3, 3) float64
+    free : (k,) int
+        Texels whose frames were found, and may be improved while the field is fitted.
+    """
+
+    local_from_base: NDArray[np.float64]
+    free: Indices
+
+
 def write_compressed(
-    job: Job, local_from_base: NDArray[np.float64], made_with: dict[str, Any], folder: Path
+    job: Job, frames: AlignedFrames, made_with: dict[str, Any], folder: Path
 ) -> dict[str, Any]:
     """Fit a field in the given frames, write it, and measure it on the samples."""
-    frames = local_frames(job, local_from_base)
-    model = fitted_model(job, job.base_reader.rotated(frames), folder)
-    made = field_of(job, model, frames, made_with)
+    model, reader = fitted_model(job, frames, folder)
+    made = field_of(job, model, reader.local_from_world, made_with)
     write_field(folder / "field.rfld", made)
     np.savez(folder / "model.npz", residuals=np.array(model.residuals))
     size = (folder / "field.rfld").stat().st_size
@@ -325,7 +344,7 @@ def write_compressed(
     return {
         "texels fitted": n_fitted,
         "texels that repeat another": made.n_texels - n_fitted,
-        "samples fitted": job.base_reader.rotated(frames).count_fitted(job.seen_texels),
+        "samples fitted": reader.count_fitted(job.seen_texels),
         "clusters": made.n_clusters,
         "components": made.n_components,
         "field bytes": size,
@@ -343,10 +362,13 @@ def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
     return (local_from_base @ job.texels.local_from_world).astype(np.float32)
 
 
-def fitted_model(job: Job, reader: TexelReader, scratch: Path) -> ClusteredModel:
-    """Clusters, mean, basis and coefficients in the reader's frames."""
+def fitted_model(
+    job: Job, frames: AlignedFrames, scratch: Path
+) -> tuple[ClusteredModel, TexelReader]:
+    """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
     options = job.options.compression
     seen = job.seen_texels
+    reader = job.base_reader.rotated(local_frames(job, frames.local_from_base))
     found, coefficients = completed(
         reader,
         job.training_texels(options.training_texels),
@@ -358,18 +380,32 @@ def fitted_model(job: Job, reader: TexelReader, scratch: Path) -> ClusteredModel
     )
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)
-    n_samples = job.observed.count() / len(seen)
-    if options.fits_samples(n_samples):
+    if options.fits_samples(job.observed.count() / len(seen)):
+        model, reader = _fitted_to_samples(job, model, reader, frames.free)
+    return fill_unobserved(model, job.texels.position, seen), reader
+
+
+def _fitted_to_samples(
+    job: Job, model: ClusteredModel, reader: TexelReader, free: Indices
+) -> tuple[ClusteredModel, TexelReader]:
+    """Fit to the samples, in frames that are improved on the way where they are free."""
+    options = job.options.compression.samples
+    spread = np.radians(options.frame_spread_deg)
+    parts = options.halves() if len(free) and spread > 0 else (options,)
+    for i, part in enumerate(parts):
+        if i > 0:
+            better = improved_frames(reader, model, free, spread, workers=job.resources.workers)
+            reader = reader.rotated(better)
         model = fit_samples(
             reader.rooted,
             model,
-            seen,
+            job.seen_texels,
             reader.sample_bytes_per_texel,
-            options.samples,
+            part,
             workers=job.resources.workers,
             seed=job.options.seed,
         )
-    return fill_unobserved(model, job.texels.position, seen)
+    return model, reader
 
 
 def field_of(

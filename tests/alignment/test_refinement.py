@@ -8,8 +8,8 @@ from reflfield.alignment.refinement import (
     NodeTargets,
     RefinementOptions,
     SampleSet,
-    _hold,
     fit_nodes,
+    hold,
     improve_frames,
     refine_targets,
 )
@@ -145,7 +145,7 @@ def test_normal_equations_of_the_prior_are_its_derivatives(rng):
         return strength * Rotation.from_matrix(frame @ start.T).magnitude() ** 2
 
     normal = np.zeros((5, 5))
-    _hold(Rotation.from_rotvec(away).as_matrix() @ start, start, strength, normal)
+    hold(Rotation.from_rotvec(away).as_matrix() @ start, start, strength, normal)
     h = 1e-4
     steps = h * np.eye(3)
     slope = np.array([energy(s) - energy(-s) for s in steps]) / (2 * h)

@@ -8,6 +8,7 @@ import pytest
 
 from reflfield.capture.readers import open_capture
 from reflfield.config import HoldOut, with_tables
+from reflfield.field.file import open_field
 from reflfield.pipeline import run
 from reflfield.steps.accounts import accounts_of
 from reflfield.steps.options import PipelineOptions
@@ -36,10 +37,8 @@ def test_all_accounts_add_up(finished_job):
 
 
 def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):
-    frames = finished_job.result("alignment", "alignment.npz")["local_from_base"]
-    reader = finished_job.base_reader.rotated(
-        (frames @ finished_job.texels.local_from_world).astype(np.float32)
-    )
+    field = open_field(finished_job.stages.root / "compression" / "field.rfld")
+    reader = finished_job.base_reader.rotated(field.local_from_world)
     rooted = reader.rooted(finished_job.seen_texels)
     weights = rooted.view_weights[:, :, None] * rooted.light_weights[:, None] * rooted.pairs
     account = next(
@@ -47,7 +46,8 @@ def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):
         for a in accounts_of(finished_job)
         if (a.stage, a.things) == ("compression", "samples")
     )
-    assert account.parts["fitted"] == np.count_nonzero(weights)
+    # The file holds quantised frames: a few samples at the horizon change sides.
+    assert account.parts["fitted"] == pytest.approx(np.count_nonzero(weights), rel=1e-3)
 
 
 @pytest.mark.parametrize(
