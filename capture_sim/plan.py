@@ -153,7 +153,8 @@ def plan(scene: Scene) -> Plan:
 def _planned(effect: Effect, scene: Scene, work: Workload) -> PlannedEffect:
     decision, is_on = effect.needed(scene), simulated(scene, effect)
     cost = effect.cost(scene, work) if is_on else Cost()
-    return PlannedEffect(effect.NAME, is_on, decision.reason, decision.bound, cost)
+    reason = "; ".join(filter(None, (decision.reason, cost.note)))
+    return PlannedEffect(effect.NAME, is_on, reason, decision.bound, cost)
 
 
 @dataclass(frozen=True)

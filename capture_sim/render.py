@@ -23,17 +23,19 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from capture_sim.arrival import LightArrays
-from capture_sim.effects import antialiasing, near_lights, shadows, simulated
+from capture_sim.effects import (
+    antialiasing,
+    interreflection,
+    near_lights,
+    shadows,
+    simulated,
+)
 from capture_sim.materials import Material
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer, camera_rays, towards_camera
+from capture_sim.shading import direct_light
 from capture_sim.surface import SurfacePoints, surface_points
-from capture_sim.visibility import (
-    TracedLights,
-    trace_lights,
-    worth_tracing,
-)
-from capture_sim.visibility import lit_pairs as lit_lights
+from capture_sim.visibility import TracedLights, trace_lights, worth_tracing
 
 Table = Mapping[str, Any]
 Array = NDArray[np.float64]
@@ -46,6 +48,8 @@ VALUES_PER_BATCH = 1 << 25
 RAYS_PER_BLOCK = 1 << 19
 # A jump along the ray within a pixel above this part of the object's radius is an edge.
 EDGE_STEP = 0.04
+# What light does between parts of the object, beyond shining on it.
+TRANSPORT_EFFECTS = (interreflection,)
 
 
 @dataclass(frozen=True)
@@ -392,45 +396,24 @@ def _lit_pixels(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Pixels that show the object (n,), and their radiance (n_lights, n, 3)."""
     arrays = LightArrays.of(scene, lights)
+    colour = arrays.colour.T.astype(np.float32)
+    between = [effect for effect in TRANSPORT_EFFECTS if simulated(scene, effect)]
     pixels, row = np.unique(view.pixel, return_inverse=True)
     radiance = np.zeros((len(pixels), 3, len(lights)), dtype=np.float32)
     step = max(1, PAIRS_PER_BLOCK // len(lights))
     for first in range(0, len(view.points), step):
         block = slice(first, first + step)
         points, weight = view.points[block], view.weight[block].astype(np.float32)
-        values, strength = _shaded(scene, tracer, view.camera, points, arrays, traced)
-        colour = arrays.colour.T.astype(np.float32)
+        views = towards_camera(view.camera, points.position)
+        values, strength = direct_light(scene, tracer, points, views, arrays, traced)
         _gather(values, strength, colour, row[block], weight, radiance)
+        for effect in between:
+            with scene.costs.measure(effect.NAME):
+                more = effect.apply(scene, tracer, points, views, arrays, traced)
+                _add(more, row[block], weight, radiance)
     by_light = np.zeros((len(lights), len(pixels), 3), dtype=np.float32)
     _by_light(radiance, by_light)
     return pixels, by_light
-
-
-def _shaded(
-    scene: Scene,
-    tracer: RayTracer,
-    camera: Table,
-    points: SurfacePoints,
-    lights: LightArrays,
-    traced: TracedLights | None,
-) -> tuple[NDArray[Any], NDArray[Any]]:
-    """BRDF (n, 3, n_lights), and irradiance (n, n_lights), 0 for lights that do not count."""
-    precision = scene.material.precision
-    views = towards_camera(camera, points.position)
-    local_views = np.einsum("nij,nj->ni", points.shading_from_world, views)
-    with scene.costs.measure(near_lights.NAME):
-        frames = points.shading_from_world
-        directions, strength = lights.arrive(points.position, frames, precision)
-    cosine = directions[:, 2]
-    seen = local_views[:, 2] > 0.0
-    if simulated(scene, shadows):
-        with scene.costs.measure(shadows.NAME):
-            lit = lit_lights(tracer, points, seen, cosine, lights, traced)
-    else:
-        lit = (cosine > 0.0) & seen[:, None]
-    strength *= np.where(lit, cosine, 0)
-    local_views = local_views.astype(precision)
-    return scene.material.evaluate_lights(local_views, directions, lit, points.uv), strength
 
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -455,6 +438,15 @@ def _gather(
                 if strength[n, k] > 0.0:
                     shining = number(values[n, c, k] * strength[n, k])
                     radiance[row[n], c, k] += weight[n] * colour[c, k] * shining
+
+
+@_compiled
+def _add(more: _Values, row: _Values, weight: _Values, radiance: _Values) -> None:
+    """Add radiance of points (n, 3, n_lights) to that of their pixels."""
+    for n in range(len(more)):
+        for c in range(3):
+            for k in range(more.shape[2]):
+                radiance[row[n], c, k] += weight[n] * more[n, c, k]
 
 
 @_compiled
@@ -483,7 +475,8 @@ def traced_lights(scene: Scene, tracer: RayTracer) -> TracedLights | None:
     TracedLights or None
         None if shadows are off, or views are so few that every ray of theirs is traced.
     """
-    nodes = worth_tracing(scene)
+    paths = scene.effects.get(interreflection.Options).paths
+    nodes = worth_tracing(scene, 1 + paths * simulated(scene, interreflection))
     if nodes is None:
         return None
     with scene.costs.measure(shadows.NAME):

@@ -104,6 +104,35 @@ def surface_points(
     )
 
 
+def spread_points(
+    mesh: SurfaceMesh, n: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array]:
+    """Random points, equally dense everywhere on a surface.
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+    n : int
+        Number of points.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    face : (n,) int64
+        Triangles.
+    barycentric : (n, 3) float64
+        Weights of the triangles' corners.
+    """
+    corners = mesh.vertices[mesh.faces]
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(doubled, axis=1)
+    face = rng.choice(len(area), size=n, p=area / area.sum())
+    # The square root makes the density even: R. Turk, Graphics Gems, 1990.
+    root, second = np.sqrt(rng.random(n)), rng.random(n)
+    barycentric = np.stack([1.0 - root, root * (1.0 - second), root * second], axis=1)
+    return face.astype(np.int64), barycentric
+
+
 def shadow_starts(
     mesh: SurfaceMesh, face: NDArray[np.int64], barycentric: Array, offset: float
 ) -> tuple[Array, Array]:

@@ -34,7 +34,7 @@ from capture_sim.render import (
     sample_view,
     shade,
 )
-from capture_sim.surface import SurfacePoints, surface_points
+from capture_sim.surface import SurfacePoints, spread_points, surface_points
 
 Table = Mapping[str, Any]
 Arrays = dict[str, NDArray[Any]]
@@ -253,14 +253,8 @@ def area_uniform_points(scene: Scene, rng: np.random.Generator) -> SurfacePoints
     -------
     SurfacePoints
     """
-    corners = scene.mesh.vertices[scene.mesh.faces]
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(doubled, axis=1)
-    face = rng.choice(len(area), size=scene.truth.points, p=area / area.sum())
-    # The square root makes the density even: R. Turk, Graphics Gems, 1990.
-    root, second = np.sqrt(rng.random(len(face))), rng.random(len(face))
-    barycentric = np.stack([1.0 - root, root * (1.0 - second), root * second], axis=1)
-    return surface_points(scene.mesh, scene.material, face.astype(np.int64), barycentric)
+    face, barycentric = spread_points(scene.mesh, scene.truth.points, rng)
+    return surface_points(scene.mesh, scene.material, face, barycentric)
 
 
 def _write_heldout(scene: Scene, tracer: RayTracer, truth: Path) -> None:

@@ -124,13 +124,15 @@ class TracedLights:
         return replace(self, bit=self.bit[lights])
 
 
-def worth_tracing(scene: Scene) -> Nodes | None:
+def worth_tracing(scene: Scene, queries_per_point: int = 1) -> Nodes | None:
     """Nodes if tracing them first saves rays, else None.
 
     Parameters
     ----------
     scene : Scene
         Nothing is saved with few views, and nothing is traced without shadows.
+    queries_per_point : int
+        How often visibility is asked for on behalf of each shaded point.
 
     Returns
     -------
@@ -142,7 +144,8 @@ def worth_tracing(scene: Scene) -> Nodes | None:
     # A view shows about half of the object's bounding sphere.
     pixels = 0.5 * np.pi * (scene.mesh.radius / _pixel_size(scene)) ** 2
     points = len(scene.cameras) * pixels * scene.image.samples_per_side**2
-    return nodes if 2 * len(nodes) < points and len(nodes) <= MOST_NODES else None
+    queries = points * queries_per_point
+    return nodes if 2 * len(nodes) < queries and len(nodes) <= MOST_NODES else None
 
 
 def _pixel_size(scene: Scene) -> float:

@@ -19,8 +19,9 @@ Stages, in the order in which they act, and what ``apply`` gets and returns ther
                calibration says; once a capture
 ``VIEW``       rays of the pixels; once a view, the same for all lights
 ``LIGHT``      direct light that arrives at surface points
-``TRANSPORT``  ``apply(scene, tracer, points, views, lights) -> (n, n_lights, 3)``:
-               radiance that surface points send to the camera beyond direct light
+``TRANSPORT``  ``apply(scene, tracer, points, views, lights, traced)
+               -> (n, 3, n_lights)``: radiance that surface points send to the camera
+               beyond direct light
 ``OPTICS``     ``apply(radiance, scene, frame) -> radiance``: from the radiance of the
                scene to what arrives at the pixels, (h, w, 3) float32
 ``SENSOR``     ``apply(values, scene, frame) -> values``: from what arrives to what is
@@ -111,10 +112,13 @@ class Cost:
         Rays traced.
     operations : int
         Evaluations other than rays (directions, random numbers).
+    note : str
+        What the work leaves open, for the reader of the plan.
     """
 
     rays: int = 0
     operations: int = 0
+    note: str = ""
 
 
 @dataclass(frozen=True)

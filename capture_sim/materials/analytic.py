@@ -125,6 +125,11 @@ class AshikhminShirley(_Parametric):
         kernels.add_coupled_diffuse(views, lights, albedo, specular, values)
         return values
 
+    def lobe(self, uv: Array) -> Array:
+        """alpha^2 = 2 / (n + 2), which has the same curvature at the peak."""
+        exponents = np.hstack([self.exponent_u.scalar(uv), self.exponent_v.scalar(uv)])
+        return np.asarray(np.sqrt(2.0 / (exponents + 2.0)))
+
     @property
     def precision(self) -> type[np.floating[Any]]:
         """float64: exponents magnify the rounding of half vectors."""
@@ -244,6 +249,10 @@ class GGX(_Parametric):
             albedo = _like(views, self.diffuse.rgb(uv))
             kernels.add_coupled_diffuse(views, lights, albedo, at_normal, values)
         return values
+
+    def lobe(self, uv: Array) -> Array:
+        """The roughness itself."""
+        return np.hstack([self.alpha_x.scalar(uv), self.alpha_y.scalar(uv)])
 
     @property
     def precision(self) -> type[np.floating[Any]]:

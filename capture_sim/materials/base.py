@@ -92,6 +92,22 @@ class Material(ABC):
         values[point, :, light] = pairs
         return values
 
+    def lobe(self, uv: Array) -> Array:
+        """Width of the highlight, to draw directions from.
+
+        Parameters
+        ----------
+        uv : (n, 2) float64
+            Texture coordinates.
+
+        Returns
+        -------
+        (n, 2) float64
+            Roughness along tangent and binormal of the GGX distribution that is most
+            like the highlight; 0 where there is none.
+        """
+        return np.zeros((len(uv), 2))
+
     @property
     def precision(self) -> type[np.floating[Any]]:
         """Type in which `evaluate_lights` keeps about five digits."""

@@ -65,6 +65,14 @@ class MeasuredRGL(Material):
         """True if the material looks the same turned about its normal."""
         return len(self.phi) <= 2
 
+    def lobe(self, uv: Array) -> Array:
+        """Roughness whose GGX density has the measured height at the normal.
+
+        Isotropic, and at least a hundredth: the peaks of the tables are one cell wide.
+        """
+        peak = float(self.density.values[0, :, 0].max())
+        return np.full((len(uv), 2), np.clip((np.pi * peak) ** -0.5, 0.01, 1.0))
+
     def _reflect(self, views: Array, lights: Array, uv: Array) -> Array:
         views, lights = self._first_sector(views, lights)
         halves, _ = half_vectors(views, lights)

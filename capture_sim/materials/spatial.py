@@ -66,6 +66,10 @@ class SpatiallyVarying(Material):
             values *= self.tint.rgb(uv)[:, :, None].astype(values.dtype)
         return values
 
+    def lobe(self, uv: Array) -> Array:
+        """That of the base."""
+        return self.base.lobe(uv)
+
     @property
     def precision(self) -> type[np.floating[Any]]:
         """That of the base."""
@@ -143,6 +147,13 @@ class Mixed(Material):
                     views[here], lights[here], lit[here], uv[here]
                 )
         return values
+
+    def lobe(self, uv: Array) -> Array:
+        """That of the material at each point."""
+        labels, lobes = self.label(uv), np.zeros((len(uv), 2))
+        for index, material in enumerate(self.materials):
+            lobes[labels == index] = material.lobe(uv[labels == index])
+        return lobes
 
     @property
     def precision(self) -> type[np.floating[Any]]:

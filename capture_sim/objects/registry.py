@@ -11,12 +11,13 @@ from capture_sim.errors import scene_error
 from capture_sim.objects.files import mesh_from_file
 from capture_sim.objects.mesh import SurfaceMesh
 from capture_sim.objects.plates import plane, relief
-from capture_sim.objects.revolution import sphere, vase
+from capture_sim.objects.revolution import bowl, sphere, vase
 from capture_sim.tables import Table, TableReader
 
 PRESETS: dict[str, dict[str, Any]] = {
     "vase": {"type": "vase"},
     "amphora": {"type": "vase", "handles": 2},
+    "bowl": {"type": "bowl"},
     "sphere": {"type": "sphere"},
     "relief": {"type": "relief"},
     "wavy_plate": {"type": "relief", "pattern": "waves", "height": 0.004},
@@ -65,6 +66,7 @@ def make_object(table: Table, folder: Path = Path()) -> SurfaceMesh:
     type      keys (metres unless they say otherwise)
     ========  ==============================================================
     vase      height, handles (0 to 2), open, around, along (facets)
+    bowl      radius, around, along (facets)
     sphere    radius, around
     relief    size [x, y], pattern (logo, waves, bumps, image), file, height,
               thickness (0: the relief alone), facets
@@ -91,6 +93,7 @@ def make_object(table: Table, folder: Path = Path()) -> SurfaceMesh:
 
 
 _MAKERS: dict[str, Callable[[TableReader, Path], SurfaceMesh]] = {
+    "bowl": bowl,
     "mesh": mesh_from_file,
     "plane": plane,
     "relief": relief,

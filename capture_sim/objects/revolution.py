@@ -62,6 +62,31 @@ VASE_INSIDE = np.array(
         [0.000, 0.070],
     ]
 )
+# The same of a bowl of radius 1: from the foot outside up to the lip, and down inside.
+BOWL_OUTSIDE = np.array(
+    [
+        [0.00, 0.00],
+        [0.15, 0.00],
+        [0.40, 0.00],
+        [0.62, 0.04],
+        [0.85, 0.25],
+        [0.97, 0.50],
+        [1.00, 0.75],
+        [0.985, 0.79],
+    ]
+)
+BOWL_INSIDE = np.array(
+    [
+        [0.95, 0.79],
+        [0.93, 0.75],
+        [0.90, 0.52],
+        [0.78, 0.31],
+        [0.57, 0.12],
+        [0.38, 0.08],
+        [0.15, 0.08],
+        [0.00, 0.08],
+    ]
+)
 # Control points of a handle from shoulder to neck; both ends lie inside the body.
 HANDLE = np.array(
     [
@@ -162,6 +187,15 @@ def vase(reader: TableReader, folder: Path) -> SurfaceMesh:
     body = revolve(height * profile, slopes, around, "vase")
     handles = [_handle(height, side, around // 4) for side in (1.0, -1.0)[:n_handles]]
     return joined([body, *handles], "vase")
+
+
+def bowl(reader: TableReader, folder: Path) -> SurfaceMesh:
+    """Open bowl with a rounded lip."""
+    radius = reader.number("radius", 0.08, low=1e-4, high=1e3)
+    around = reader.count("around", 192, low=8, high=4096)
+    along = reader.count("along", 160, low=16, high=4096)
+    profile, slopes = smooth_curve(np.concatenate([BOWL_OUTSIDE, BOWL_INSIDE]), along)
+    return revolve(radius * profile, slopes, around, "bowl")
 
 
 def smooth_curve(control: Array, n_steps: int) -> tuple[Array, Array]:

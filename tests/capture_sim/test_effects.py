@@ -7,7 +7,6 @@ from capture_sim.effects import (
     Frame,
     Workload,
     antialiasing,
-    interreflection,
     near_lights,
     sensor_noise,
     shadows,
@@ -58,7 +57,7 @@ def test_effects_can_be_forced(mode, traced):
 @pytest.mark.parametrize(
     ("choice", "expected"),
     [
-        ("auto", {"antialiasing", "near_lights", "shadows"}),
+        ("auto", {"antialiasing", "near_lights", "shadows", "interreflection"}),
         ("none", set()),
         (["shadows"], {"shadows"}),
         ({"simulate": "none", "near_lights": "on"}, {"near_lights"}),
@@ -96,11 +95,6 @@ def test_far_field_is_the_light_at_the_centre():
     np.testing.assert_array_equal(flat.directions[:, 0], [[0, 0, 1], [0, 0, 1]])
     np.testing.assert_array_equal(flat.irradiance[:, 0, 0], [2.0, 2.0])
     assert exact.irradiance[0, 0, 0] == pytest.approx(8 / 4.25)
-
-
-def test_interreflection_is_declared_missing():
-    assert interreflection.needed(scene("vase")).reason.startswith("not simulated")
-    assert "convex" in interreflection.needed(scene("sphere")).reason
 
 
 def test_antialiasing_is_off_with_single_rays():
