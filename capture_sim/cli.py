@@ -75,10 +75,13 @@ def render(
     ] = 0,
 ) -> None:
     """Simulate a capture: photographs, silhouettes, calibration and truth."""
+    loaded = _loaded(scene, effects)
+    for note in loaded.mesh.notes:
+        print(f"capture-sim: repaired {note}", file=sys.stderr)
     with _progress_bar() as bar:
         task = bar.add_task("views", total=None)
         write_capture(
-            _loaded(scene, effects),
+            loaded,
             output,
             workers=workers,
             overwrite=overwrite,

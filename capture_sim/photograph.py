@@ -24,6 +24,7 @@ from capture_sim.effects import (
 )
 from capture_sim.effects.rig import real_rig
 from capture_sim.model import Scene
+from capture_sim.placement import check_outside
 from capture_sim.rays import RayTracer
 from capture_sim.render import ViewSamples, render_view, sample_view, shade
 from capture_sim.visibility import TracedLights
@@ -78,8 +79,16 @@ def set_up(scene: Scene) -> Setup:
     Returns
     -------
     Setup
+
+    Raises
+    ------
+    SceneError
+        If an error of the rig brings a camera or a lamp inside the object.
     """
-    return Setup(scene, real_rig(scene))
+    setup = Setup(scene, real_rig(scene))
+    if setup.differs:
+        check_outside(scene.mesh, setup.rig.cameras, setup.rig.lights)
+    return setup
 
 
 def photographs(

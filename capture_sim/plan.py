@@ -71,6 +71,8 @@ class Plan:
         Estimated time of one worker on this machine.
     bytes : int
         Estimated size of the capture.
+    repairs : tuple of str
+        What was wrong with the object's mesh and has been repaired.
     """
 
     scene: str
@@ -78,6 +80,7 @@ class Plan:
     effects: tuple[PlannedEffect, ...]
     seconds: float
     bytes: int
+    repairs: tuple[str, ...] = ()
 
     @property
     def rays(self) -> int:
@@ -94,6 +97,7 @@ class Plan:
             f"shading      {work.n_lit / 1e6:.1f} million lit pairs of point and light",
             f"time         about {_seconds_text(self.seconds)} on one worker",
             f"size         about {self.bytes / 1e6:.1f} MB",
+            *(f"repaired     {note}" for note in self.repairs),
             "effects      name                 leaving it out    cost  why",
         ]
         return counts + [
@@ -146,6 +150,7 @@ def plan(scene: Scene) -> Plan:
         work=work,
         effects=tuple(_planned(effect, scene, work) for effect in EFFECTS),
         seconds=n_views * trial.view_seconds + frames * trial.photograph_seconds,
+        repairs=scene.mesh.notes,
         bytes=int(n_views * trial.view_bytes + frames * trial.photograph_bytes) + fixed_bytes,
     )
 

@@ -78,6 +78,7 @@ def effects_record(scene: Scene, contributed: Mapping[str, Contribution]) -> dic
         "simulate": choice if isinstance(choice, str) else list(choice),
         "tolerance": scene.effects.tolerance,
         "brightness": asdict(scene.brightness),
+        "repairs": list(scene.mesh.notes),
         "effects": [_line(scene, effect, contributed.get(effect.NAME)) for effect in EFFECTS],
     }
 

@@ -49,6 +49,7 @@ from capture_sim.errors import SceneError, scene_error
 from capture_sim.materials import make_material
 from capture_sim.model import EffectOptions, ImageOptions, Scene, TruthOptions
 from capture_sim.objects import make_object
+from capture_sim.placement import check_outside
 from capture_sim.tables import TableReader
 
 Table = Mapping[str, Any]
@@ -183,6 +184,7 @@ def parse_scene(table: Table, *, default_name: str = "scene", folder: Path = Pat
         truth=_truth_options(reader.take("truth", {})),
     )
     reader.finish()
+    check_outside(scene.mesh, scene.cameras, scene.lights)
     return scene
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,19 @@ from scipy.spatial.transform import Rotation
 
 from capture_sim.errors import scene_error
 from capture_sim.objects.mesh import Array, Faces, SurfaceMesh, unit, without_slivers
+from capture_sim.objects.repair import places, repaired
 from capture_sim.tables import TableReader
 
 MOST_FACES = 20_000_000
-# Relative to the size of the object: files store single precision or few digits.
-SAME_PLACE = 1e-7
 
 
 def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     """Mesh file, turned, centred, scaled and moved."""
     path = reader.file("file", folder)
-    vertices, faces, uv = read_mesh(path)
+    found = repaired(*read_mesh(path))
+    if len(found.faces) == 0:
+        raise scene_error(reader.name("file"), "triangles with an area", f"none in {path}")
+    vertices = found.vertices
     rotation = Rotation.from_euler(
         "xyz", reader.vector("rotation_deg", (0, 0, 0)), degrees=True
     )
@@ -33,7 +36,9 @@ def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     scale = reader.number("scale", 1.0, low=1e-9, high=1e9)
     size = reader.number("size", extent * scale, low=1e-9, high=1e9)
     vertices = vertices * (size / extent) + reader.vector("position", (0, 0, 0))
-    return finish_mesh(vertices, faces, uv, path.name, smooth=reader.flag("smooth", True))
+    smooth = reader.flag("smooth", True)
+    mesh = finish_mesh(vertices, found.faces, found.uv, path.name, smooth=smooth)
+    return replace(mesh, notes=tuple(f"{path.name}: {note}" for note in found.notes))
 
 
 def read_mesh(path: Path) -> tuple[Array, Faces, Array | None]:
@@ -115,7 +120,7 @@ def finish_mesh(
     if not smooth:  # no triangle shares a vertex with another
         vertices, coordinates = vertices[faces.ravel()], coordinates[faces.ravel()]
         faces = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
-    normals = _normals(vertices, faces, _places(vertices) if smooth else faces.ravel())
+    normals = _normals(vertices, faces, places(vertices) if smooth else faces.ravel())
     return SurfaceMesh(
         vertices=vertices,
         faces=faces,
@@ -125,13 +130,6 @@ def finish_mesh(
         has_uv=uv is not None,
         name=name,
     )
-
-
-def _places(vertices: Array) -> NDArray[np.intp]:
-    """Number of the place of each vertex; seams have several vertices in one place."""
-    size = np.ptp(vertices, axis=0).max()
-    rounded = np.round(vertices / (SAME_PLACE * size))
-    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].ravel())
 
 
 def _normals(vertices: Array, faces: Faces, places: NDArray[np.integer[Any]]) -> Array:

@@ -42,6 +42,8 @@ class SurfaceMesh:
         True if `uv` means anything.
     name : str
         Kind or file the mesh was made from.
+    notes : tuple of str
+        What was wrong with the file and has been repaired.
     """
 
     vertices: Array
@@ -52,6 +54,7 @@ class SurfaceMesh:
     convex: bool = False
     has_uv: bool = True
     name: str = "object"
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def centre(self) -> Array:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from capture_sim.errors import scene_error
+from capture_sim.objects.convexity import is_convex
 from capture_sim.objects.files import mesh_from_file
 from capture_sim.objects.mesh import SurfaceMesh
 from capture_sim.objects.plates import plane, relief
@@ -89,7 +91,7 @@ def make_object(table: Table, folder: Path = Path()) -> SurfaceMesh:
     kind = reader.choice("type", "", sorted(_MAKERS))
     mesh = _MAKERS[kind](reader, folder)
     reader.finish()
-    return mesh
+    return replace(mesh, convex=is_convex(mesh))
 
 
 _MAKERS: dict[str, Callable[[TableReader, Path], SurfaceMesh]] = {
