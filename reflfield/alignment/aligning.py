@@ -12,7 +12,6 @@ from reflfield.alignment.gauge import Gauged, fix_gauge, fold, turn_targets
 from reflfield.alignment.horizon import Horizon, extend_targets, settle
 from reflfield.alignment.materials import Materials, choose, one_round, spread_rows, tell_apart
 from reflfield.alignment.refinement import (
-    NodeTargets,
     RefinementOptions,
     SampleSet,
     refine_targets,
@@ -31,6 +30,7 @@ from reflfield.alignment.searching import (
     one_core_blas,
     search,
 )
+from reflfield.alignment.splines import NodeTargets
 from reflfield.checks import unit_directions
 from reflfield.errors import InputError, ShapeError
 from reflfield.progress import track

@@ -28,15 +28,14 @@ from numpy.typing import NDArray
 
 from reflfield.alignment.refinement import (
     BLOCK,
-    LOWEST_Z,
-    NodeTargets,
     RefinementOptions,
     SampleSet,
     fit_nodes,
     improve_frames,
 )
 from reflfield.alignment.searching import map_blocks
-from reflfield.sphere.hemisphere import first_tap, square_from_xyz
+from reflfield.alignment.splines import NodeTargets, expect, place
+from reflfield.sphere.hemisphere import LOWEST_Z, first_tap, square_from_xyz
 
 # Nodes along each side of the grids on which residuals are compared.
 RESIDUAL_SIDE = 7
@@ -121,39 +120,6 @@ def _taps(
 
 
 @numba.njit(cache=True, nogil=True)
-def _expected(
-    target: NDArray[np.float32],
-    nodes: tuple[NDArray[np.int64], NDArray[np.int64]],
-    shares: tuple[NDArray[np.float64], NDArray[np.float64]],
-    sides: tuple[int, int],
-    line: NDArray[np.float32],
-    out: NDArray[np.float32],
-) -> None:
-    """Target at all pairs of directions of one texel; NaN below a horizon."""
-    right, up = (1, sides[0]) if sides[0] > 1 else (0, 0)
-    l_right, l_up = (1, sides[1]) if sides[1] > 1 else (0, 0)
-    for v in range(out.shape[0]):
-        node = nodes[0][v]
-        if node < 0:
-            out[v] = np.nan
-            continue
-        s, t = np.float32(shares[0][v, 0]), np.float32(shares[0][v, 1])
-        for k in range(line.shape[0]):
-            low = target[node, k] + s * (target[node + right, k] - target[node, k])
-            rise = target[node + up + right, k] - target[node + up, k]
-            line[k] = low + t * (target[node + up, k] + s * rise - low)
-        for k in range(out.shape[1]):
-            tap = nodes[1][k]
-            if tap < 0:
-                out[v, k] = np.nan
-                continue
-            a, b = np.float32(shares[1][k, 0]), np.float32(shares[1][k, 1])
-            low = line[tap] + a * (line[tap + l_right] - line[tap])
-            high = line[tap + l_up] + a * (line[tap + l_up + l_right] - line[tap + l_up])
-            out[v, k] = low + b * (high - low)
-
-
-@numba.njit(cache=True, nogil=True)
 def _moments(
     samples: NDArray[np.float32], expected: NDArray[np.float32], floor: float
 ) -> tuple[float, float, float]:
@@ -183,18 +149,19 @@ def _misfits(
 ) -> None:
     """Distance of each texel to each target; 1 where either is zero."""
     n_views, n_lights = samples.shape[1:]
-    nodes = (np.zeros(n_views, np.int64), np.zeros(n_lights, np.int64))
-    shares = (np.zeros((n_views, 2)), np.zeros((n_lights, 2)))
+    first = (np.zeros(n_views, np.int64), np.zeros(n_lights, np.int64))
+    taps = (np.zeros((n_views, 4, 4), np.float32), np.zeros((n_lights, 4, 4), np.float32))
+    turns = (np.zeros((n_views, 6), np.float32), np.zeros((n_lights, 6), np.float32))
     line = np.zeros(targets.shape[2], np.float32)
     expected = np.zeros((n_views, n_lights), np.float32)
     for i in range(samples.shape[0]):
         out[i] = 1.0
         if floors[i] <= 0.0:
             continue
-        _taps(views[i % len(views)], frames[i], sides[0], nodes[0], shares[0])
-        _taps(lights[i % len(lights)], frames[i], sides[1], nodes[1], shares[1])
+        place(views[i % len(views)], frames[i], sides[0], first[0], taps[0], turns[0])
+        place(lights[i % len(lights)], frames[i], sides[1], first[1], taps[1], turns[1])
         for k in range(targets.shape[0]):
-            _expected(targets[k], nodes, shares, sides, line, expected)
+            expect(targets[k], sides, first, taps, line, expected)
             yy, ym, mm = _moments(samples[i], expected, floors[i])
             if ym > 0.0:
                 out[i, k] = max(1.0 - (ym / yy) * (ym / mm), 0.0)
@@ -258,6 +225,8 @@ def _features(
     n_views, n_lights = samples.shape[1:]
     nodes = (np.zeros(n_views, np.int64), np.zeros(n_lights, np.int64))
     shares = (np.zeros((n_views, 2)), np.zeros((n_lights, 2)))
+    taps = (np.zeros((n_views, 4, 4), np.float32), np.zeros((n_lights, 4, 4), np.float32))
+    turns = (np.zeros((n_views, 6), np.float32), np.zeros((n_lights, 6), np.float32))
     line = np.zeros(targets.shape[2], np.float32)
     expected = np.zeros((n_views, n_lights), np.float32)
     sums = np.zeros((2, coarse[0] ** 2, coarse[1] ** 2))
@@ -266,9 +235,9 @@ def _features(
         if floors[i] <= 0.0:
             continue
         view, light = views[i % len(views)], lights[i % len(lights)]
-        _taps(view, frames[i], sides[0], nodes[0], shares[0])
-        _taps(light, frames[i], sides[1], nodes[1], shares[1])
-        _expected(targets[cluster[i]], nodes, shares, sides, line, expected)
+        place(view, frames[i], sides[0], nodes[0], taps[0], turns[0])
+        place(light, frames[i], sides[1], nodes[1], taps[1], turns[1])
+        expect(targets[cluster[i]], sides, nodes, taps, line, expected)
         yy, ym, mm = _moments(samples[i], expected, floors[i])
         if not ym > 0.0:
             continue

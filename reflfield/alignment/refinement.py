@@ -1,18 +1,10 @@
 r"""Frames refined on the samples themselves.
 
 The aligned texels sample one reflectance far more densely than any of them, so
-a sharp target exists: values on the nodes of two hemisphere grids (views and lights,
-bilinear, 16 taps a sample), fitted to the samples of all texels by normalised
-backprojection,
-
-.. math::
-
-    c \leftarrow c + \frac{\sum_i s_i T_i^\top (y_i - s_i T_i c)}{\sum_i s_i^2 T_i^\top 1},
-
-where :math:`T_i` interpolates at the sample directions in the frame of texel i and
-:math:`s_i` is its brightness. Frames and brightness then follow by Gauss-Newton steps
-on the weighted squares of :math:`y_i - s_i T_i c`; samples below either horizon of
-the frame are left out. Both are repeated. A Gaussian prior may hold each frame to the one
+a sharp target exists (see `reflfield.alignment.splines`), fitted to the samples of all
+texels. Frames and brightness of each texel then follow by Gauss-Newton steps on the same
+weighted squares of :math:`y_i - s_i T_i c`; samples below either horizon of the frame are left
+out. Both are repeated. A Gaussian prior may hold each frame to the one
 given: with :math:`\omega` the turn between them, :math:`v |\omega|^2 / \text{spread}^2` is
 added to the squares, :math:`v` being the texel's weighted squared residual per sample.
 """
@@ -29,21 +21,24 @@ from numpy.typing import NDArray
 from reflfield.alignment.climbing import copy_matrix, turned
 from reflfield.alignment.climbing import scale as shrink
 from reflfield.alignment.searching import map_blocks
+from reflfield.alignment.splines import (
+    FAST,
+    NodeTargets,
+    back_project,
+    blend_view,
+    place,
+    value_at,
+)
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
-from reflfield.sphere.hemisphere import first_tap, square_from_xyz
 
-# Half of the step by which the taps' positions are differenced, radians: well below the
-# six degrees between nodes, well above the rounding of float32.
-HALF_STEP = np.deg2rad(0.25)
-# Directions this close to the frame's horizon are left out: their taps would leave the grid
-# within one step.
-LOWEST_Z = float(np.sin(np.deg2rad(1.0)))
-# Reordering of sums only: samples may be NaN, which full fast mathematics assumes away.
-FAST = {"reassoc", "contract", "nsz", "arcp"}
 LONGEST_STEP = np.deg2rad(4.0)
 DAMPING = 1e-4
 BLOCK = 128
+# Parts that the samples are summed in: their sums are held together.
+FIT_PARTS = 8
+# Weight of the mean node in the preconditioner: nodes that hardly any sample touches stay.
+LEAST_TOUCH = 1e-3
 
 
 @dataclass(frozen=True)
@@ -53,11 +48,13 @@ class RefinementOptions:
     Parameters
     ----------
     side : int
-        Nodes along the side of each hemisphere grid.
+        Nodes along the side of each square of directions, 5 at least. Two of them stand
+        outside the hemisphere.
     rounds : int
         Rounds of target and frames.
-    backprojections : int
-        Steps of the target fit per round.
+    fit_steps : int
+        Steps of conjugate gradients of the target fit per round. More let the target
+        follow the wrong frames.
     steps : int
         Gauss-Newton steps per round.
     last_steps : int
@@ -73,15 +70,17 @@ class RefinementOptions:
     """
 
     side: int = 25
-    rounds: int = 6
-    backprojections: int = 4
+    rounds: int = 4
+    fit_steps: int = 6
     steps: int = 2
-    last_steps: int = 5
+    last_steps: int = 2
     floor: float = 0.3
-    texels_per_cluster: int = 2048
+    texels_per_cluster: int = 1024
     spread: float = math.inf
 
     def __post_init__(self) -> None:
+        if self.side < 5:
+            raise InputError(f"side: expected at least 5 nodes, received {self.side}")
         if not self.spread > 0:
             raise InputError(f"spread: expected radians > 0, received {self.spread}")
 
@@ -137,210 +136,45 @@ class SampleSet:
         return np.sqrt(squares.sum(axis=(1, 2)) / count)
 
 
-@dataclass(frozen=True, eq=False)
-class NodeTargets:
-    """Sharp targets on hemisphere nodes.
-
-    Parameters
-    ----------
-    values : (n_clusters, view_side**2, light_side**2) float32
-    view_side, light_side : int
-        1: that direction does not vary.
-    """
-
-    values: NDArray[np.float32]
-    view_side: int
-    light_side: int
-
-
-@numba.njit(cache=True, nogil=True)
-def place_directions(
-    directions: NDArray[np.float64],
-    frame: NDArray[np.float64],
-    side: int,
-    nodes: NDArray[np.int64],
-    places: NDArray[np.float64],
-) -> None:
-    """First node (-1 below the horizon), shares s and t, and their six derivatives."""
-    local, other = np.zeros(3), np.zeros(3)
-    scale = 0.5 * (side - 1) / (2.0 * HALF_STEP)
-    for i in range(directions.shape[0]):
-        for k in range(3):
-            local[k] = (
-                frame[k, 0] * directions[i, 0]
-                + frame[k, 1] * directions[i, 1]
-                + frame[k, 2] * directions[i, 2]
-            )
-        if side == 1:
-            nodes[i] = 0
-            places[i] = 0.0
-            continue
-        if local[2] < LOWEST_Z:
-            nodes[i] = -1
-            continue
-        u, v = square_from_xyz(local[0], local[1], local[2])
-        column, places[i, 0] = first_tap(u, side)
-        row, places[i, 1] = first_tap(v, side)
-        nodes[i] = row * side + column
-        for k in range(3):
-            # Turning by w about axis k moves d by w x d.
-            a, b = (k + 1) % 3, (k + 2) % 3
-            other[0], other[1], other[2] = local[0], local[1], local[2]
-            other[a], other[b] = (
-                local[a] - HALF_STEP * local[b],
-                local[b] + HALF_STEP * local[a],
-            )
-            u1, v1 = square_from_xyz(other[0], other[1], other[2])
-            other[a], other[b] = (
-                local[a] + HALF_STEP * local[b],
-                local[b] - HALF_STEP * local[a],
-            )
-            u0, v0 = square_from_xyz(other[0], other[1], other[2])
-            places[i, 2 + k] = (u1 - u0) * scale
-            places[i, 5 + k] = (v1 - v0) * scale
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _blend(
-    target: NDArray[np.float32],
-    node: int,
-    side: int,
-    s: float,
-    t: float,
-    lines: NDArray[np.float32],
-) -> None:
-    """Rows of the target at one view: interpolated, and differentiated in s and t."""
-    right, up = (1, side) if side > 1 else (0, 0)
-    a, b = np.float32(s), np.float32(t)
-    one = np.float32(1.0)
-    for k in range(target.shape[1]):
-        low = target[node, k] + a * (target[node + right, k] - target[node, k])
-        rise = target[node + up + right, k] - target[node + up, k]
-        high = target[node + up, k] + a * rise
-        lines[0, k] = low + b * (high - low)
-        lines[1, k] = (one - b) * (target[node + right, k] - target[node, k]) + b * rise
-        lines[2, k] = high - low
-
-
-@numba.njit(cache=True, nogil=True)
-def _spread_row(
-    row: NDArray[np.float32],
-    scale: float,
-    expected: NDArray[np.float32],
-    l_nodes: NDArray[np.int64],
-    l_places: NDArray[np.float64],
-    side: int,
-    out: NDArray[np.float64],
-) -> None:
-    """Scatter one view's residuals and weights to the light nodes, interleaved."""
-    right, up = (1, side) if side > 1 else (0, 0)
-    out[:] = 0.0
-    for k in range(row.shape[0]):
-        node, value = l_nodes[k], row[k]
-        if node < 0 or not np.isfinite(value):
-            continue
-        a, b = l_places[k, 0], l_places[k, 1]
-        w0, w1, w2, w3 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        model = w0 * expected[node] + w1 * expected[node + right]
-        model += w2 * expected[node + up] + w3 * expected[node + up + right]
-        rest = scale * (value - scale * model)
-        power = scale * scale
-        out[2 * node] += w0 * rest
-        out[2 * node + 1] += w0 * power
-        out[2 * (node + right)] += w1 * rest
-        out[2 * (node + right) + 1] += w1 * power
-        out[2 * (node + up)] += w2 * rest
-        out[2 * (node + up) + 1] += w2 * power
-        out[2 * (node + up + right)] += w3 * rest
-        out[2 * (node + up + right) + 1] += w3 * power
-
-
-@numba.njit(cache=True, nogil=True)
-def spread(
-    samples: NDArray[np.float32],
-    views: NDArray[np.float64],
-    lights: NDArray[np.float64],
-    frames: NDArray[np.float64],
-    brightness: NDArray[np.float64],
-    target: NDArray[np.float32],
-    sides: tuple[int, int],
-    sums: NDArray[np.float64],
-) -> None:
-    """Add numerator and denominator of the backprojection of some texels to `sums`.
-
-    They are interleaved along the light nodes: (view nodes, 2 * light nodes).
-    """
-    n_views, n_lights = samples.shape[1:]
-    v_nodes, v_places = np.zeros(n_views, np.int64), np.zeros((n_views, 8))
-    l_nodes, l_places = np.zeros(n_lights, np.int64), np.zeros((n_lights, 8))
-    lines = np.zeros((3, target.shape[1]), np.float32)
-    out = np.zeros(2 * target.shape[1])
-    right, up = (1, sides[0]) if sides[0] > 1 else (0, 0)
-    for i in range(samples.shape[0]):
-        if brightness[i] <= 0.0:
-            continue
-        place_directions(views[i % len(views)], frames[i], sides[0], v_nodes, v_places)
-        place_directions(lights[i % len(lights)], frames[i], sides[1], l_nodes, l_places)
-        for v in range(n_views):
-            node = v_nodes[v]
-            if node < 0:
-                continue
-            s, t = v_places[v, 0], v_places[v, 1]
-            _blend(target, node, sides[0], s, t, lines)
-            _spread_row(
-                samples[i, v], brightness[i], lines[0], l_nodes, l_places, sides[1], out
-            )
-            w0, w1, w2, w3 = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
-            for k in range(out.shape[0]):
-                sums[node, k] += w0 * out[k]
-                sums[node + right, k] += w1 * out[k]
-                sums[node + up, k] += w2 * out[k]
-                sums[node + up + right, k] += w3 * out[k]
-
-
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _add_row(
     row: NDArray[np.float32],
-    place: NDArray[np.float64],
     lines: NDArray[np.float32],
-    l_nodes: NDArray[np.int64],
-    l_places: NDArray[np.float64],
+    v_turns: NDArray[np.float32],
+    l_first: NDArray[np.int64],
+    l_taps: NDArray[np.float32],
+    l_turns: NDArray[np.float32],
     side: int,
     scale: float,
     floor: float,
     normal: NDArray[np.float64],
 ) -> None:
     """Add one view's samples to the normal equations of (w, log s), cost and weight."""
-    right, up = (1, side) if side > 1 else (0, 0)
     jacobian = np.zeros(5)
     for k in range(row.shape[0]):
-        node, value = l_nodes[k], row[k]
-        if node < 0 or not np.isfinite(value):
+        value, first = row[k], l_first[k]
+        if first < 0 or not np.isfinite(value):
             continue
-        a, b = l_places[k, 0], l_places[k, 1]
-        p0, p1 = lines[0, node], lines[0, node + right]
-        p2, p3 = lines[0, node + up], lines[0, node + up + right]
-        low, high = p0 + a * (p1 - p0), p2 + a * (p3 - p2)
-        expected = low + b * (high - low)
-        in_s, in_t = (1 - b) * (p1 - p0) + b * (p3 - p2), high - low
-        w0, w1, w2, w3 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        view_s = w0 * lines[1, node] + w1 * lines[1, node + right]
-        view_s += w2 * lines[1, node + up] + w3 * lines[1, node + up + right]
-        view_t = w0 * lines[2, node] + w1 * lines[2, node + right]
-        view_t += w2 * lines[2, node + up] + w3 * lines[2, node + up + right]
+        u, du, v, dv = l_taps[k, 0], l_taps[k, 1], l_taps[k, 2], l_taps[k, 3]
+        expected = value_at(lines[0], first, side, u, v)
+        view_u = value_at(lines[1], first, side, u, v)
+        view_v = value_at(lines[2], first, side, u, v)
+        light_u = value_at(lines[0], first, side, du, v)
+        light_v = value_at(lines[0], first, side, u, dv)
         for n in range(3):
             jacobian[n] = scale * (
-                view_s * place[2 + n]
-                + view_t * place[5 + n]
-                + in_s * l_places[k, 2 + n]
-                + in_t * l_places[k, 5 + n]
+                view_u * v_turns[n]
+                + view_v * v_turns[3 + n]
+                + light_u * l_turns[k, n]
+                + light_v * l_turns[k, 3 + n]
             )
         jacobian[3] = scale * expected
         jacobian[4] = value - scale * expected
-        weight = 1.0 / (floor + np.abs(value))
+        weight = 1.0 / (floor + abs(value))
         for n in range(5):
             for m in range(n + 1):
                 normal[n, m] += weight * jacobian[n] * jacobian[m]
+        # The otherwise unused upper triangle: sum of weights, and count.
         normal[0, 4] += weight
         normal[1, 4] += 1.0
 
@@ -349,8 +183,9 @@ def _add_row(
 def _add_views(
     samples: NDArray[np.float32],
     target: NDArray[np.float32],
-    nodes: tuple[NDArray[np.int64], NDArray[np.int64]],
-    places: tuple[NDArray[np.float64], NDArray[np.float64]],
+    first: tuple[NDArray[np.int64], NDArray[np.int64]],
+    taps: tuple[NDArray[np.float32], NDArray[np.float32]],
+    turns: tuple[NDArray[np.float32], NDArray[np.float32]],
     sides: tuple[int, int],
     scale_and_floor: tuple[float, float],
     lines: NDArray[np.float32],
@@ -359,11 +194,19 @@ def _add_views(
     """Add one texel's samples to its normal equations; `lines` is scratch."""
     scale, floor = scale_and_floor
     for v in range(samples.shape[0]):
-        if nodes[0][v] >= 0:
-            place = places[0][v]
-            _blend(target, nodes[0][v], sides[0], place[0], place[1], lines)
+        if first[0][v] >= 0:
+            blend_view(target, first[0][v], sides[0], taps[0][v], lines)
             _add_row(
-                samples[v], place, lines, nodes[1], places[1], sides[1], scale, floor, normal
+                samples[v],
+                lines,
+                turns[0][v],
+                first[1],
+                taps[1],
+                turns[1],
+                sides[1],
+                scale,
+                floor,
+                normal,
             )
 
 
@@ -462,8 +305,11 @@ def improve(
     the samples less the four unknowns.
     """
     n_views, n_lights = samples.shape[1:]
-    v_nodes, v_places = np.zeros(n_views, np.int64), np.zeros((n_views, 8))
-    l_nodes, l_places = np.zeros(n_lights, np.int64), np.zeros((n_lights, 8))
+    v_first, l_first = np.zeros(n_views, np.int64), np.zeros(n_lights, np.int64)
+    v_taps = np.zeros((n_views, 4, 4), np.float32)
+    l_taps = np.zeros((n_lights, 4, 4), np.float32)
+    v_turns = np.zeros((n_views, 6), np.float32)
+    l_turns = np.zeros((n_lights, 6), np.float32)
     lines = np.zeros((3, target.shape[1]), np.float32)
     normal, step, turn = np.zeros((5, 5)), np.zeros(4), np.zeros((3, 3))
     frame, scale_factor = np.zeros((3, 3)), 1.0
@@ -475,13 +321,14 @@ def improve(
         for n in range(n_steps + 1):
             normal[:] = 0.0
             scale = brightness[i] * scale_factor if n > 0 else brightness[i]
-            place_directions(views[i % len(views)], frame, sides[0], v_nodes, v_places)
-            place_directions(lights[i % len(lights)], frame, sides[1], l_nodes, l_places)
+            place(views[i % len(views)], frame, sides[0], v_first, v_taps, v_turns)
+            place(lights[i % len(lights)], frame, sides[1], l_first, l_taps, l_turns)
             _add_views(
                 samples[i],
                 target,
-                (v_nodes, l_nodes),
-                (v_places, l_places),
+                (v_first, l_first),
+                (v_taps, l_taps),
+                (v_turns, l_turns),
                 sides,
                 (scale, floor),
                 lines,
@@ -512,7 +359,7 @@ def fit_nodes(
     options: RefinementOptions,
     n_threads: int,
 ) -> NodeTargets:
-    """Targets after some steps of normalised backprojection.
+    """Targets after some steps of conjugate gradients towards the samples.
 
     Parameters
     ----------
@@ -533,34 +380,70 @@ def fit_nodes(
     NodeTargets
     """
     values = targets.values.copy()
-    sides = (targets.view_side, targets.light_side)
     for k in range(len(values)):
-        mine = np.flatnonzero(cluster == k)
+        mine = np.flatnonzero((cluster == k) & (brightness > 0))
+        if len(mine):
+            fit = _Fit(data, mine, frames, brightness, targets.sides, options.floor, n_threads)
+            values[k] = fit.solve(values[k], options.fit_steps)
+    return NodeTargets(values, *targets.sides)
 
-        def block(
-            rows: slice, k: int = k, mine: NDArray[np.int64] = mine
-        ) -> NDArray[np.float64]:
-            sums = np.zeros((values[k].shape[0], 2 * values[k].shape[1]))
-            own = mine[rows]
-            part = data.part(own)
-            spread(
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The normal equations of one cluster's nodes, by sums over its texels `rows`."""
+
+    data: SampleSet
+    rows: NDArray[np.int64]
+    frames: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    sides: tuple[int, int]
+    floor: float
+    n_threads: int
+
+    def solve(self, values: NDArray[np.float32], n_steps: int) -> NDArray[np.float32]:
+        """Nodes after some steps of preconditioned conjugate gradients from `values`."""
+        nodes = values.astype(np.float64)
+        rest, touched = self.sums(values, with_samples=True)
+        scale = 1.0 / (touched + LEAST_TOUCH * touched.mean() + 1e-300)
+        direction = scale * rest
+        power = np.vdot(rest, direction)
+        for _ in range(n_steps):
+            product, _ = self.sums(direction.astype(np.float32), with_samples=False)
+            curvature = -np.vdot(direction, product)
+            if not curvature > 0.0:
+                break
+            nodes += (power / curvature) * direction
+            rest += (power / curvature) * product
+            before, power = power, np.vdot(rest, scale * rest)
+            direction = scale * rest + (power / before) * direction
+        return nodes.astype(np.float32)
+
+    def sums(
+        self, values: NDArray[np.float32], with_samples: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Backprojected residuals and, with samples, the weight on each node."""
+
+        def block(rows: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            own = self.rows[rows]
+            part = self.data.part(own)
+            sums, touched = np.zeros(values.shape), np.zeros(values.shape)
+            back_project(
                 part.samples,
                 *part.directions(),
-                frames[own],
-                brightness[own],
-                values[k],
-                sides,
+                self.frames[own],
+                self.brightness[own],
+                values,
+                self.sides,
+                self.floor,
+                with_samples,
                 sums,
+                touched,
             )
-            return sums
+            return sums, touched
 
-        for _ in range(options.backprojections if len(mine) else 0):
-            sums = np.sum(map_blocks(block, len(mine), 2 * BLOCK, n_threads), axis=0)
-            # Nodes that hardly any sample touches stay where they are.
-            weight = sums[:, 1::2]
-            touched = weight + 1e-3 * weight.mean() + 1e-300
-            values[k] += (sums[:, ::2] / touched).astype(np.float32)
-    return NodeTargets(values, *sides)
+        size = max(BLOCK // 2, -(-len(self.rows) // FIT_PARTS))
+        parts = map_blocks(block, len(self.rows), size, self.n_threads)
+        return np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
 
 
 def improve_frames(
@@ -579,7 +462,7 @@ def improve_frames(
     The prior, if any, holds the frames to `starts`, (n, 3, 3), or to where they are.
     """
     starts = frames.copy() if starts is None else starts
-    sides = (targets.view_side, targets.light_side)
+    sides = targets.sides
 
     def block(rows: slice) -> None:
         for k in np.unique(cluster[rows]):

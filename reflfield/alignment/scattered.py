@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from reflfield.alignment.gauge import mean_rotation
 from reflfield.alignment.refinement import (
-    NodeTargets,
     RefinementOptions,
     SampleSet,
     improve_frames,
     refine_targets,
 )
+from reflfield.alignment.splines import NodeTargets
 from reflfield.checks import check_shape
 from reflfield.progress import track
 

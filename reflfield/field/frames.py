@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from reflfield.alignment.climbing import copy_matrix
 from reflfield.alignment.climbing import scale as shrink
-from reflfield.alignment.refinement import FAST, hold, place_directions, solve_step, turn_frame
+from reflfield.alignment.refinement import hold, solve_step, turn_frame
+from reflfield.alignment.splines import FAST
 from reflfield.checks import check_shape
 from reflfield.field.fit import ClusteredModel
 from reflfield.observations.reading import TexelReader
 from reflfield.observations.resampling import POWERS, root
 from reflfield.progress import track
-from reflfield.sphere.hemisphere import softened_cosine_of
+from reflfield.sphere.hemisphere import place_directions, softened_cosine_of
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

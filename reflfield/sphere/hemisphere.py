@@ -24,6 +24,11 @@ from reflfield.checks import check_shape
 from reflfield.errors import InputError
 
 QUARTER_PI = np.pi / 4
+# Half of the step by which the taps' positions are differenced, radians: well below the
+# six degrees between nodes, well above the rounding of float32.
+HALF_STEP = np.deg2rad(0.25)
+# Directions this close to the frame's horizon are left out: a step could take them below.
+LOWEST_Z = float(np.sin(np.deg2rad(1.0)))
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -271,3 +276,50 @@ def softened_cosine(z: NDArray[np.floating]) -> NDArray[np.floating]:
     """
     foot = (np.clip(z, -HORIZON_SOFTNESS, HORIZON_SOFTNESS) + HORIZON_SOFTNESS) ** 2
     return np.where(z >= HORIZON_SOFTNESS, z, foot / (4.0 * HORIZON_SOFTNESS))
+
+
+@numba.njit(cache=True, nogil=True)
+def place_directions(
+    directions: NDArray[np.float64],
+    frame: NDArray[np.float64],
+    side: int,
+    nodes: NDArray[np.int64],
+    places: NDArray[np.float64],
+) -> None:
+    """First node (-1 below the horizon), shares s and t, and their six derivatives."""
+    local, other = np.zeros(3), np.zeros(3)
+    scale = 0.5 * (side - 1) / (2.0 * HALF_STEP)
+    for i in range(directions.shape[0]):
+        for k in range(3):
+            local[k] = (
+                frame[k, 0] * directions[i, 0]
+                + frame[k, 1] * directions[i, 1]
+                + frame[k, 2] * directions[i, 2]
+            )
+        if side == 1:
+            nodes[i] = 0
+            places[i] = 0.0
+            continue
+        if local[2] < LOWEST_Z:
+            nodes[i] = -1
+            continue
+        u, v = square_from_xyz(local[0], local[1], local[2])
+        column, places[i, 0] = first_tap(u, side)
+        row, places[i, 1] = first_tap(v, side)
+        nodes[i] = row * side + column
+        for k in range(3):
+            # Turning by w about axis k moves d by w x d.
+            a, b = (k + 1) % 3, (k + 2) % 3
+            other[0], other[1], other[2] = local[0], local[1], local[2]
+            other[a], other[b] = (
+                local[a] - HALF_STEP * local[b],
+                local[b] + HALF_STEP * local[a],
+            )
+            u1, v1 = square_from_xyz(other[0], other[1], other[2])
+            other[a], other[b] = (
+                local[a] + HALF_STEP * local[b],
+                local[b] - HALF_STEP * local[a],
+            )
+            u0, v0 = square_from_xyz(other[0], other[1], other[2])
+            places[i, 2 + k] = (u1 - u0) * scale
+            places[i, 5 + k] = (v1 - v0) * scale

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from reflfield.sphere.harmonics import real_harmonics
 
@@ -52,3 +53,13 @@ def quadrature_sum(a, b, rotation, n_directions=64):
     )
     left, right = y @ a @ y.T, turned @ b @ turned.T
     return float(np.sum(left * right * area[:, None] * area[None, :]))
+
+
+def spline_matrix(local, side):
+    """Dense interpolation matrix of directions, by SciPy's B-splines on Lambert's map."""
+    up = np.maximum(local[:, 2:], 0.0)
+    position = 1.0 + 0.5 * (side - 3) * (1.0 + local[:, :2] / np.sqrt(1.0 + up))
+    element = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
+    weights = np.nan_to_num(element(position[:, :, None] - np.arange(side)))
+    out = weights[:, 1, :, None] * weights[:, 0, None, :]
+    return np.where(local[:, 2:] > 0, out.reshape(len(local), -1), 0)

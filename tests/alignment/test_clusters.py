@@ -6,8 +6,9 @@ from scipy.optimize import linear_sum_assignment
 
 from reflfield.alignment import RefinementOptions, align, aligning
 from reflfield.alignment.materials import Materials, misfits, residual_features, tell_apart
-from reflfield.alignment.refinement import LOWEST_Z, NodeTargets, SampleSet
-from reflfield.sphere.hemisphere import HemisphereGrid
+from reflfield.alignment.refinement import SampleSet
+from reflfield.alignment.splines import NodeTargets
+from reflfield.sphere.hemisphere import LOWEST_Z
 from reflfield.sphere.rotations import frames_from_normals
 
 # Coarser and shorter than the default, so that each test takes seconds.
@@ -108,15 +109,13 @@ def crude_state(scene, rng):
 
 
 @pytest.mark.reference
-def test_distance_is_that_of_dense_interpolation(crude_state):
+def test_distance_is_that_of_dense_interpolation(crude_state, references):
     data, frames, targets = crude_state
-    floor, grid = 0.3, HemisphereGrid(7)
+    floor = 0.3
     found = misfits(data, frames, targets, floor, 1)
     for i, frame in enumerate(frames):
         local = data.views @ frame.T
-        nodes, weights = grid.taps(local)
-        dense = np.zeros((len(local), 49))
-        np.add.at(dense, (np.arange(len(local))[:, None], nodes), weights)
+        dense = references.spline_matrix(local, 7)
         y = data.samples[i].astype(np.float64)
         seen = np.isfinite(y) & np.outer(local[:, 2] >= LOWEST_Z, local[:, 2] >= LOWEST_Z)
         w = 1.0 / (floor * data.brightness()[i] + np.abs(y[seen]))

@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment.refinement import (
-    NodeTargets,
     RefinementOptions,
     SampleSet,
     fit_nodes,
@@ -13,6 +12,7 @@ from reflfield.alignment.refinement import (
     improve_frames,
     refine_targets,
 )
+from reflfield.alignment.splines import NodeTargets
 from reflfield.errors import InputError, ShapeError
 
 OPTIONS = RefinementOptions(side=11, rounds=3)
@@ -81,7 +81,7 @@ def sharp(relief):
     data, _, truth = relief
     n = len(truth)
     empty = NodeTargets(np.zeros((1, 11**2, 11**2), np.float32), 11, 11)
-    options = RefinementOptions(side=11, backprojections=12)
+    options = RefinementOptions(side=11, fit_steps=12)
     cluster = np.zeros(n, np.int32)
     return fit_nodes(data, truth, data.brightness(), cluster, empty, options, 1)
 
