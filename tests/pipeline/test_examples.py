@@ -28,7 +28,7 @@ def test_align_synthetic_btf(subprocess_run, tmp_path):
     )
     assert done.status == 0, done.err
     table = [line.split("|") for line in done.out.splitlines() if line.startswith("| clean")]
-    errors = {row[2].strip(): float(row[4]) for row in table}
+    errors = {row[2].strip(): float(row[5]) for row in table}
     # Few texels on a coarse relief: a tenth of what a constant guess (the base frame) errs.
     assert errors["refined"] < errors["harmonic"] < 3.0
     assert "unaligned ones" in done.out
