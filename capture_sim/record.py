@@ -105,7 +105,7 @@ def _finite(value: float) -> float | None:
 
 
 def _write_differences(scene: Scene, one: Contribution, folder: Path) -> None:
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for (view, light), difference in one.differences.items():
         name = f"{scene.cameras[view]['id']}_{scene.lights[light]['id']}.exr"
         write_exr(folder / name, difference)

@@ -258,7 +258,7 @@ def area_uniform_points(scene: Scene, rng: np.random.Generator) -> SurfacePoints
 
 
 def _write_heldout(scene: Scene, tracer: RayTracer, truth: Path) -> None:
-    (truth / "heldout").mkdir()
+    (truth / "heldout").mkdir(exist_ok=True)
     frames = []
     for camera, light in heldout_pairs(scene):
         view = sample_view(scene, tracer, camera)

@@ -1,7 +1,8 @@
 """The native capture directory, version 1.
 
 Everything goes to a hidden folder beside the target, which is renamed when
-complete: a capture is either there and whole, or not there.
+complete: a capture is either there and whole, or not there. What was interrupted
+stays in the hidden folder, each file of it whole, and the same command goes on from there.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from capture_sim.effects import Frame, exposure_brackets, simulated
 from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
 from capture_sim.files import write_exr, write_json, write_png, write_silhouette
+from capture_sim.fingerprint import fingerprint
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup, photographs, set_up
 from capture_sim.rays import RayTracer
@@ -35,6 +37,7 @@ Table = Mapping[str, Any]
 
 GENERATOR = "capture_sim"
 CAPTURE_FILE = "capture.json"
+FINGERPRINT_FILE = "scene.sha256"
 
 # (views done, views in all); called once more for the truth that is not per view.
 Progress = Callable[[int, int], None]
@@ -56,7 +59,8 @@ def write_capture(
     scene : Scene
         What to simulate.
     folder : Path
-        Written as a whole at the end; the bytes do not depend on `workers`.
+        Written as a whole at the end; the bytes do not depend on `workers`. Photographs
+        of the same scene that an interrupted call left are taken over.
     workers : int
         Views rendered at the same time.
     overwrite : bool
@@ -77,21 +81,29 @@ def write_capture(
         If the folder exists and may not be replaced.
     """
     check_target(folder, overwrite=overwrite)
+    part = _begun(scene, folder)
+    # One thread traces at a time, on behalf of all.
+    tracer = RayTracer(scene.mesh, n_threads=workers)
+    setup = set_up(measured(scene, tracer))
+    report, steps = progress or _no_progress, len(scene.cameras) + 1
+    _write_views(setup, tracer, part, workers, report)
+    _write_rest(setup, tracer, part, n_contributions)
+    report(steps, steps)
+    (part / FINGERPRINT_FILE).unlink()
+    _move_into_place(part, folder)
+    return folder
+
+
+def _begun(scene: Scene, folder: Path) -> Path:
+    """The hidden folder, with what an interrupted call for the same scene left in it."""
     part = folder.parent / f".{folder.name}.incomplete"
+    mark, file = fingerprint(scene), part / FINGERPRINT_FILE
+    if file.is_file() and file.read_text(encoding="ascii") == mark:
+        return part
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    try:
-        # One thread traces at a time, on behalf of all.
-        tracer = RayTracer(scene.mesh, n_threads=workers)
-        setup = set_up(measured(scene, tracer))
-        report, steps = progress or _no_progress, len(scene.cameras) + 1
-        _write_views(setup, tracer, part, workers, report)
-        _write_rest(setup, tracer, part, n_contributions)
-        report(steps, steps)
-        _move_into_place(part, folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return folder
+    file.write_text(mark, encoding="ascii")
+    return part
 
 
 def _no_progress(done: int, total: int) -> None:
@@ -148,7 +160,7 @@ def _write_views(
 ) -> None:
     traced = traced_lights(setup.real, tracer)
     for name in ("photographs", "silhouettes"):
-        (folder / name).mkdir()
+        (folder / name).mkdir(exist_ok=True)
     views = range(len(setup.scene.cameras))
     steps = len(views) + 1
     progress(0, steps)
@@ -181,13 +193,24 @@ def _write_view(
 ) -> None:
     scene = setup.real
     camera = scene.cameras[index]
-    view = sample_view(scene, tracer, camera)
-    write_silhouette(folder / _silhouette(camera), view.coverage)
-    lights = np.flatnonzero(setup.rig.taken[index])
-    for frame, radiance in photographs(scene, tracer, index, lights, view, traced):
-        _write_photograph(scene, folder, frame, radiance)
+    files = [_files(scene, camera, light) for light in scene.lights]
+    missing = [not all((folder / file).is_file() for file in names) for names in files]
+    lights = np.flatnonzero(setup.rig.taken[index] & missing)
+    silhouette = folder / _silhouette(camera)
+    if len(lights) or not silhouette.is_file():
+        view = sample_view(scene, tracer, camera)
+        for frame, radiance in photographs(scene, tracer, index, lights, view, traced):
+            _write_photograph(scene, folder, frame, radiance)
+        _whole(silhouette, write_silhouette, view.coverage)
     if scene.truth.per_view:
         write_view_truth(scene, tracer, camera, folder)
+
+
+def _files(scene: Scene, camera: Table, light: Table) -> list[str]:
+    """Files of one photograph."""
+    if simulated(scene, exposure_brackets):
+        return [exposure["file"] for exposure in _exposures(scene, camera, light)]
+    return [_photograph(camera["id"], light["id"])]
 
 
 def _write_photograph(
@@ -196,12 +219,19 @@ def _write_photograph(
     camera, light = frame.camera, scene.lights[frame.light]
     if not simulated(scene, exposure_brackets):
         values = exposed(scene, radiance, frame)
-        write_exr(folder / _photograph(camera["id"], light["id"]), values)
+        _whole(folder / _photograph(camera["id"], light["id"]), write_exr, values)
         return
     for index, exposure in enumerate(_exposures(scene, camera, light)):
         bracket = replace(frame, exposure=index, seconds=exposure["seconds"])
         values = exposed(scene, radiance, bracket)
-        write_png(folder / exposure["file"], exposure_brackets.apply(values))
+        _whole(folder / exposure["file"], write_png, exposure_brackets.apply(values))
+
+
+def _whole(path: Path, write: Callable[[Path, Any], None], values: Any) -> None:
+    """Write a file under another name first: what has its name is whole."""
+    beginning = path.with_name(f".{path.name}")
+    write(beginning, values)
+    beginning.rename(path)
 
 
 def _photograph(camera: str, light: str) -> str:

@@ -14,6 +14,7 @@ from PIL import Image
 import capture_sim.write
 from capture_sim.errors import SceneError
 from capture_sim.files import write_exr, write_npz, write_ply
+from capture_sim.fingerprint import fingerprint
 from capture_sim.objects import make_object
 from capture_sim.scene import parse_scene
 from capture_sim.write import write_capture
@@ -155,14 +156,61 @@ def test_other_folders_and_files_are_never_replaced(tmp_path):
     assert (tmp_path / "thesis" / "final.tex").read_text() == "years of work"
 
 
-def test_failure_leaves_nothing_behind(tmp_path, monkeypatch):
+def test_an_interrupted_capture_goes_on_by_photograph(capture, tmp_path, monkeypatch):
+    whole, written = capture_sim.write.write_exr, []
+
+    def interrupted(path, values):
+        if len(written) == 4:
+            path.write_bytes(b"half a file")
+            raise OSError("disk full")
+        written.append(path.name)
+        whole(path, values)
+
+    monkeypatch.setattr(capture_sim.write, "write_exr", interrupted)
+    with pytest.raises(OSError, match="disk full"):
+        write_capture(scene(), tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+    monkeypatch.setattr(
+        capture_sim.write, "write_exr", lambda p, v: (written.append(p.name), whole(p, v))
+    )
+    again = write_capture(scene(), tmp_path / "again")
+    assert len(written) == len(set(written)) == 9  # each of them once
+    files = [name for name in files_of(capture) if name != "truth/effects.json"]
+    assert files_of(again) == files_of(capture)
+    assert filecmp.cmpfiles(capture, again, files, shallow=False)[1:] == ([], [])
+    assert [path.name for path in tmp_path.iterdir()] == ["again"]
+
+
+def test_what_was_begun_for_another_scene_is_not_taken_over(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise OSError("disk full")
 
-    monkeypatch.setattr(capture_sim.write, "write_truth", fail)
-    with pytest.raises(OSError, match="disk full"):
-        write_capture(scene(), tmp_path / "capture")
-    assert list(tmp_path.iterdir()) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(capture_sim.write, "write_truth", fail)
+        with pytest.raises(OSError, match="disk full"):
+            write_capture(scene(seed=7), tmp_path / "again")
+    assert [path.name for path in tmp_path.iterdir()] == [".again.incomplete"]
+    written = []
+    whole = capture_sim.write.write_exr
+    monkeypatch.setattr(
+        capture_sim.write, "write_exr", lambda p, v: (written.append(p.name), whole(p, v))
+    )
+    write_capture(scene(), tmp_path / "again")
+    assert len(written) == 9
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"seed": 2},
+        {"material": {"preset": "painted_vase", "labels": {"type": "bands"}}},
+        {"object": {"preset": "vase", "around": 48, "along": 33}},
+        {"effects": {"shadows": "off"}},
+    ],
+)
+def test_fingerprints_tell_scenes_apart(changed):
+    assert fingerprint(scene()) == fingerprint(scene())
+    assert fingerprint(scene(**changed)) != fingerprint(scene())
 
 
 def test_progress_counts_views_and_truth(tmp_path):
