@@ -26,6 +26,7 @@ from capture_sim.errors import SceneError
 from capture_sim.materials import material_presets
 from capture_sim.objects import object_presets
 from capture_sim.plan import plan as make_plan
+from capture_sim.record import table_lines
 from capture_sim.scene import Scene, load_scene, shipped_scenes
 from capture_sim.write import write_capture
 
@@ -88,7 +89,8 @@ def render(
             n_contributions=contributions,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    _console().print(f"Wrote {output}", highlight=False, soft_wrap=True)
+    for line in [*table_lines(output), f"Wrote {output}"]:
+        _console().print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 @app.command()

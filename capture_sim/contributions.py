@@ -45,8 +45,8 @@ class Contribution:
     change : float
         Largest of all changes, each as a part of its photograph's 99th percentile.
     seconds : float
-        What it added to the rendering of one photograph: time with it less time
-        without it. The noise of the clock can make it negative.
+        Processor seconds that it added to the rendering of one photograph, those of
+        all threads together: with it less without it. Noise can make it negative.
     """
 
     name: str
@@ -90,6 +90,7 @@ def contributions(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> list[Co
         In the order of the effects. Those that are on are left out for comparison, those
         that are off but described are added. Missing photographs have none.
     """
+    arriving(scene, tracer, pairs[:1])  # what is compiled or traced once is no part of it
     everything, seconds = arriving(scene, tracer, pairs)
     found = []
     for effect in EFFECTS:
@@ -114,7 +115,7 @@ def _described(scene: Scene, effect: Effect) -> bool:
 
 
 def arriving(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> tuple[Images, float]:
-    """Some photographs before the sensor, and the seconds that they took.
+    """Some photographs before the sensor, and the processor seconds that they took.
 
     Parameters
     ----------
@@ -130,24 +131,24 @@ def arriving(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> tuple[Images
     seconds : float
     """
     real = set_up(scene).real
-    start = time.perf_counter()
+    start = time.process_time()
     images: dict[Pair, Float32] = {}
     for view in sorted({view for view, _ in pairs}):
         lights = np.array(sorted(light for v, light in pairs if v == view), dtype=np.intp)
         for frame, radiance in photographs(real, tracer, view, lights):
             images[view, frame.light] = radiance
-    return images, time.perf_counter() - start
+    return images, time.process_time() - start
 
 
 def _of_sensor(scene: Scene, effect: Effect, images: Images) -> Contribution:
     """The effect alone on what arrives at the sensor."""
     alone = replace(scene, effects=replace(scene.effects, active=frozenset({effect.NAME})))
-    start = time.perf_counter()
+    start = time.process_time()
     recorded = {
         pair: _recorded(alone, image, Frame(alone.cameras[pair[0]], *pair))
         for pair, image in images.items()
     }
-    seconds = (time.perf_counter() - start) / len(images)
+    seconds = (time.process_time() - start) / len(images)
     contribution = _compared(effect, recorded, images, seconds)
     change = max(relative_change(images[p], recorded[p]) for p in images)
     return replace(contribution, change=change)

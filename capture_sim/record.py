@@ -10,8 +10,9 @@ the capture reports.
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -111,23 +112,33 @@ def _write_differences(scene: Scene, one: Contribution, folder: Path) -> None:
         write_exr(folder / name, difference)
 
 
-def table_lines(effects: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Lines of ``truth/effects.json`` as text.
+def table_lines(folder: Path) -> list[str]:
+    """The table of effects that a capture holds, as text.
 
     Parameters
     ----------
-    effects : iterable of mapping
-        Entries of its list `effects`.
+    folder : Path
+        The capture.
 
     Returns
     -------
     list of str
+        One line an effect: on or off, name, bound, what it contributed if that was asked
+        for, the seconds that it took, and why.
     """
-    return [
+    record = json.loads((folder / EFFECTS_FILE).read_text(encoding="utf-8"))
+    return [_text(line) for line in record["effects"]]
+
+
+def _text(line: Mapping[str, Any]) -> str:
+    changed = ""
+    if "contribution" in line:
+        change = line["contribution"]
+        changed = "infinite" if change is None else f"{100.0 * change:.3g} %"
+    return (
         f"{'on' if line['on'] else 'off':3}  {line['name']:20} {bound_text(line['bound']):>12}"
-        f"  {line['seconds']:8.2f} s  {line['reason']}"
-        for line in effects
-    ]
+        f" {changed:>9} {line['seconds']:8.2f} s  {line['reason']}"
+    )
 
 
 def bound_text(bound: float | None) -> str:

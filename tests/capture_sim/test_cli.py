@@ -104,7 +104,12 @@ def test_effects_are_chosen_on_the_command_line(run, tiny, tmp_path):
     on = {line.split()[1] for line in out.splitlines() if line.startswith("  on ")}
     assert on == {"vignetting", "bayer"}
     folder = tmp_path / "out"
-    run("render", tiny, "-o", folder, "--effects", "vignetting", "--contributions", 1)
+    _, out, _ = run(
+        *("render", tiny, "-o", folder, "--effects", "vignetting", "--contributions", 1)
+    )
+    shown = next(line for line in out.splitlines() if "vignetting" in line)
+    assert shown.split()[0] == "on"
+    assert shown.count("%") == 3  # bound, contribution, reason
     names = {path.name for path in (folder / "truth" / "contributions").iterdir()}
     assert "vignetting" in names
     assert "bayer" not in names

@@ -6,14 +6,14 @@ from dataclasses import replace
 import pytest
 
 from capture_sim.brightness import measured
-from capture_sim.contributions import contributions, some_pairs
+from capture_sim.contributions import arriving, contributions, some_pairs
 from capture_sim.effects import threshold
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.registry import EFFECTS, decided
 from capture_sim.rays import RayTracer
 from capture_sim.scene import load_scene
 
-PRESETS = ("vase", "relief", "spot", "two_materials")
-SIDE = 24  # pixels
+PRESETS = ("vase", "relief", "spot", "two_materials", "bowl")
+SIDE = 16  # pixels
 # Effects that have no picture of their own to compare.
 NO_PICTURE = {"dropped_photographs"}
 
@@ -40,7 +40,7 @@ def test_the_plan_is_right(name):
     scene = small(name)
     tracer = RayTracer(scene.mesh, n_threads=2)
     known = measured(scene, tracer)
-    found = {one.name: one for one in contributions(known, tracer, some_pairs(known, 4))}
+    found = {one.name: one for one in contributions(known, tracer, some_pairs(known, 3))}
     on = known.effects.active
     wrong = {}
     for effect in EFFECTS:
@@ -65,4 +65,23 @@ def test_presets_call_for_different_effects():
     assert "near_lights" not in active["two_materials"]
     assert "defocus" not in active["relief"]
     assert "environment" not in active["vase"]
+    assert "interreflection" in active["bowl"]
     assert "bayer" in active["spot"]
+
+
+def test_effects_that_are_off_never_run(monkeypatch):
+    """Off is free: a scene that describes everything and simulates nothing calls nothing."""
+    described = load_scene("vase").effects.parameters
+
+    def fail(*_, **__):
+        raise AssertionError
+
+    for effect in EFFECTS:
+        if effect.NAME != "near_lights":  # its `apply` gives the light at the centre, once
+            monkeypatch.setattr(effect, "apply", fail)
+    scene = small("vase")
+    off = replace(scene.effects, simulate="none", parameters=described)
+    scene = decided(replace(scene, effects=off))
+    images, _ = arriving(scene, RayTracer(scene.mesh), [(0, 0)])
+    assert images[0, 0].max() > 0.0
+    assert not scene.effects.active
