@@ -4,8 +4,33 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
+TINY_SCENE = """
+[object]
+preset = "sphere"
+radius = 0.05
+[material]
+preset = "satin"
+[cameras]
+preset = "rings"
+elevations_deg = [-30, 10, 50]
+counts = [3, 4, 3]
+distance = 0.5
+extent = 0.13
+width = 32
+height = 32
+[lights]
+preset = "rings"
+elevations_deg = [10, 60]
+counts = [4, 2]
+distance = 0.6
+[heldout]
+frames = 2
+[truth]
+points = 20
+"""
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -49,3 +74,17 @@ def test_accuracy_against_time(subprocess_run, tmp_path):
     assert float(rows["exact"]["normals"]) < 0.5 * float(rows["K=4"]["normals"])
     assert float(rows["exact"]["milliseconds"]) < float(rows["brute force"]["milliseconds"])
     assert np.asarray(Image.open(tmp_path / "accuracy_against_time.png")).std() > 20
+
+
+@pytest.mark.slow
+def test_effects_on_the_pipeline(subprocess_run, tiny_options, tmp_path):
+    scene = tmp_path / "tiny.toml"
+    scene.write_text(TINY_SCENE)
+    done = subprocess_run(
+        *(EXAMPLES / "effects_on_the_pipeline.py", tmp_path / "out", "--scene", scene),
+        *("--config", tiny_options, "--effects", "bayer"),
+    )
+    assert done.status == 0, done.err
+    table = (tmp_path / "out" / "effects.md").read_text()
+    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == ["none", "bayer"]
+    assert (tmp_path / "out" / "effects.png").stat().st_size > 10_000

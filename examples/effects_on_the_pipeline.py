@@ -1,0 +1,154 @@
+"""What each effect of the simulator does to the pipeline: one at a time on one scene.
+
+    python examples/effects_on_the_pipeline.py OUT
+    python examples/effects_on_the_pipeline.py OUT --effects defocus,bayer
+
+Simulates the scene without errors and once with each effect, makes a field of each
+capture, and compares it with true photographs of unseen views under unseen lights, with
+the true surface, and with its true frames. Results stay in OUT/NAME/result.json: a second
+call with other effects adds to them. Writes OUT/effects.md and OUT/effects.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+
+from capture_sim.effects import dropped_photographs, environment, light_extent
+from capture_sim.effects.registry import EFFECTS
+from capture_sim.model import Scene
+from capture_sim.scene import load_scene
+from capture_sim.write import write_capture
+from reflfield.capture.readers import open_capture
+from reflfield.comparison.truth import open_truth
+from reflfield.config import Resources, read_toml, with_tables
+from reflfield.field.file import open_field
+from reflfield.pipeline import run
+from reflfield.steps import evaluation
+from reflfield.steps.options import PipelineOptions
+
+NOTHING = "none"
+# What every capture has: these make the image, they do not spoil it.
+ALWAYS = ("antialiasing", "near_lights", "shadows")
+# Fewer samples than usual: the errors of a pipeline are larger than those of sampling.
+PARAMETERS = (
+    environment.Options(samples=32),
+    light_extent.Options(samples=5),
+    dropped_photographs.Options(fraction=0.1),
+)
+# A coarse field, fitted in few rounds: twenty of them are made.
+OPTIONS = {
+    "texture": {"texels_per_pixel": 0.6},
+    "alignment": {"iterations": 2},
+    "compression": {"samples": {"rounds": 2, "iterations": 6}},
+}
+COLUMNS = {
+    "psnr": "PSNR, dB",
+    "hull_mm": "hull error, mm",
+    "normal_deg": "normals, degrees",
+    "tangent_deg": "tangents, degrees",
+}
+
+
+def with_effect(scene: Scene, name: str) -> Scene:
+    """The scene with one effect on, besides those that every capture has."""
+    choice = replace(scene.effects, simulate=(*ALWAYS, name), parameters=PARAMETERS, forced={})
+    return replace(scene, effects=choice)
+
+
+def score(capture: Path, out: Path, options: PipelineOptions, workers: int) -> dict:
+    """Run the pipeline and compare its field with the truth."""
+    resources = Resources(workers=workers)
+    job = run(open_capture(capture), out, options, resources=resources, last="comparison")
+    truth = open_truth(capture)
+    field = open_field(job.stages.root / "compression" / "field.rfld")
+    frames, _ = evaluation.frame_scores(job, truth, field)
+    return {
+        "psnr": evaluation.stored_comparison(job, "truth")["mean"]["psnr_ldr"],
+        "hull_mm": evaluation.hull_score(job, truth).summary()["mean_mm"],
+        "normal_deg": frames.summary()["normal_median_deg"],
+        "tangent_deg": frames.summary()["tangent_median_deg"],
+    }
+
+
+def measure(scene: Scene, name: str, out: Path, options: PipelineOptions, workers: int) -> None:
+    """Simulate, process and score one effect, unless that has been done."""
+    folder = out / name
+    if (folder / "result.json").is_file():
+        return
+    capture = write_capture(
+        with_effect(scene, name), folder / "capture", workers=workers, overwrite=True
+    )
+    result = score(capture, folder / "run", options, workers)
+    (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+    for part in ("capture", "run"):
+        shutil.rmtree(folder / part)
+
+
+def table(results: dict[str, dict]) -> str:
+    """Markdown: one line an effect, what differs from none in brackets."""
+    lines = ["| effect | " + " | ".join(COLUMNS.values()) + " |", "|---" * 5 + "|"]
+    for name, result in results.items():
+        cells = [f"{result[key]:.2f}" for key in COLUMNS]
+        if name != NOTHING and NOTHING in results:
+            changes = [result[key] - results[NOTHING][key] for key in COLUMNS]
+            cells = [f"{c} ({d:+.2f})" for c, d in zip(cells, changes, strict=True)]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def plot(results: dict[str, dict], path: Path) -> None:
+    """Bars of every measure; the line is the capture without errors."""
+    names = [name for name in results if name != NOTHING]
+    figure, axes = plt.subplots(1, 4, figsize=(13, 0.32 * len(names) + 1.2), sharey=True)
+    for axis, (key, title) in zip(axes, COLUMNS.items(), strict=True):
+        axis.barh(names, [results[name][key] for name in names], color="tab:blue")
+        if NOTHING in results:
+            axis.axvline(results[NOTHING][key], color="black", linewidth=1)
+        if key == "psnr":
+            values = [result[key] for result in results.values()]
+            axis.set_xlim(min(values) - 1, max(values) + 0.5)
+        axis.set_title(title)
+    axes[0].invert_yaxis()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    """Parse, measure, tell."""
+    names = [effect.NAME for effect in EFFECTS if effect.NAME not in ALWAYS]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--scene", default="demo_vase", help="name or TOML file")
+    parser.add_argument("--effects", default=",".join(names), help="names with commas")
+    parser.add_argument("--config", type=Path, help="options of the pipeline in TOML")
+    parser.add_argument("--workers", type=int, default=2)
+    arguments = parser.parse_args()
+
+    tables = read_toml(arguments.config) if arguments.config else OPTIONS
+    options = with_tables(PipelineOptions(), tables)
+    scene = load_scene(arguments.scene)
+    for name in [NOTHING, *arguments.effects.split(",")]:
+        measure(scene, name, arguments.out, options, arguments.workers)
+    order = [NOTHING, *names]
+    found = {
+        p.parent.name: json.loads(p.read_text()) for p in arguments.out.glob("*/result.json")
+    }
+    results = {name: found[name] for name in order if name in found}
+    (arguments.out / "effects.md").write_text(table(results))
+    plot(results, arguments.out / "effects.png")
+    print(table(results))
+    print(arguments.out / "effects.png")
+
+
+if __name__ == "__main__":
+    main()
