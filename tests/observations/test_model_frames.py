@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment.refinement import place_directions
 from reflfield.errors import ShapeError
 from reflfield.field.fit import ClusteredModel
 from reflfield.field.frames import _add_texel, _gains, _own_function, improved_frames
@@ -14,7 +13,7 @@ from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import TexelReader
 from reflfield.observations.resampling import ResamplingOptions
 from reflfield.observations.store import ObservationStore, Observed, create_samples
-from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
+from reflfield.sphere.hemisphere import HemisphereGrid, place_directions, softened_cosine
 
 from .rigs import dome, interpolated, tilted_frames
 
