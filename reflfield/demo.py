@@ -13,12 +13,15 @@ from reflfield.errors import ReflfieldError
 from reflfield.pipeline import run
 from reflfield.progress import report
 from reflfield.steps.job import Job
-from reflfield.steps.options import PipelineOptions, TextureOptions
+from reflfield.steps.options import ComparisonOptions, PipelineOptions, TextureOptions
 
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
 # A little coarser than usual: the demo has to end within three minutes, compilation included.
-OPTIONS = PipelineOptions(texture=TextureOptions(texels_per_pixel=1.2))
+OPTIONS = PipelineOptions(
+    texture=TextureOptions(texels_per_pixel=1.2),
+    comparison=ComparisonOptions(without_alignment=True),
+)
 
 
 def run_demo(out: Path, workers: int) -> Job:

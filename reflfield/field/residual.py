@@ -12,8 +12,8 @@ from reflfield.field.evaluation import evaluate
 from reflfield.field.model import ReflectanceField
 from reflfield.observations.reading import TexelReader
 
-# Enough for three digits of the error; more only take time.
-MOST_SAMPLES = 2_000_000
+# Enough for two digits of the error; more only take time.
+MOST_SAMPLES = 500_000
 BLOCK_BYTES = 64 << 20
 
 
