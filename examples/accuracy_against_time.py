@@ -294,6 +294,7 @@ def draw_errors(axes, points, what):
         xscale="log", yscale="log", xlabel="CPU milliseconds per ABRDF, one core",
         ylabel=f"mean error of {what}, degrees",
     )  # fmt: skip
+    axes.margins(y=0.12)
     axes.grid(True, which="both", alpha=0.25)
     axes.annotate(
         "better", xy=(0.02, 0.03), xytext=(0.09, 0.1), xycoords="axes fraction",
