@@ -40,12 +40,13 @@ from reflfield.sphere.projection import Projector
 
 # Texels whose coefficients are kept for the iterations: enough that their mean
 # has converged far below the error of one frame.
-TRAINING_TEXELS = 8192
+TRAINING_TEXELS = 2048
+TRAINING_TEXELS_PER_CLUSTER = 256
 TRAINING_BYTES = 256 * 2**20
 # Texels projected at once.
 PROJECTION_BLOCK = 128
 # Rounds of filling in what lies below the base horizon: each leaves about a third of the error.
-EXTENSIONS = 4
+EXTENSIONS = 3
 # Samples kept for the targets of the refinement.
 REFINING_BYTES = 256 * 2**20
 
@@ -154,9 +155,9 @@ def align(
 
     Notes
     -----
-    Targets are found on at most 8,192 texels drawn at random, whose coefficients stay in
-    memory; all others are then read, searched and refined once, block by block. Memory
-    does not depend on n. With fewer texels all of them take part.
+    Targets are found on at most 2,048 texels drawn at random (256 a cluster, if that is
+    more), whose coefficients stay in memory; all others are then read, searched and refined
+    once, block by block. Memory does not depend on n. With fewer texels all of them take part.
 
     Examples
     --------
@@ -172,7 +173,7 @@ def align(
     projector = _projector(source, views, lights, band_limit)
     _check_options(iterations, n_clusters, max_tilt, n_threads)
     rng = np.random.default_rng(seed)
-    rows = _training_rows(source.shape[0], projector, rng)
+    rows = _training_rows(source.shape[0], projector, n_clusters, rng)
     prior = mean_samples(source, rows)
     task = _Task(source, projector, Horizon.of(projector), prior, max_tilt, n_threads)
     with one_core_blas():
@@ -386,11 +387,14 @@ def _check_options(
         raise InputError(f"max_tilt: expected radians in (0, pi], received {max_tilt}")
 
 
-def _training_rows(n: int, projector: Projector, rng: np.random.Generator) -> NDArray[np.int64]:
+def _training_rows(
+    n: int, projector: Projector, n_clusters: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
     """Texels that take part in finding the targets, ascending."""
     limits = projector.band_limits
     size = 4 * limits[0] ** 2 * limits[1] ** 2
-    most = min(n, TRAINING_TEXELS, max(TRAINING_BYTES // size, 256))
+    wanted = max(TRAINING_TEXELS, TRAINING_TEXELS_PER_CLUSTER * n_clusters)
+    most = min(n, wanted, max(TRAINING_BYTES // size, 256))
     return np.sort(rng.choice(n, most, replace=False)) if most < n else np.arange(n)
 
 

@@ -25,8 +25,9 @@ from reflfield.sphere.wigner import rotation_blocks
 
 # Share of a target's energy that varies about the normal, below which the turn is noise.
 ISOTROPIC_SHARE = 0.01
-# Odd orders of a target with a half-turn symmetry vanish; noise and gaps leave a few per cent.
-HALF_TURN_SHARE = 0.25
+# Odd orders of a target with a half-turn symmetry vanish; what the horizon cuts off steep
+# texels leaves a sixth of the even ones, and up to a third where there are many.
+HALF_TURN_SHARE = 0.5
 AXIS_STEPS = 20
 # A symmetry axis farther from the mean normal is not the normal.
 LARGEST_AXIS_TILT = np.deg2rad(40.0)
@@ -201,17 +202,31 @@ def _normal_first(target: Coupled) -> NDArray[np.float64]:
     """Rotation that brings z to the axis of the target's half-turn symmetry, if near z.
 
     The symmetry is a peak of the target's correlation with itself, half a turn away from
-    the identity; the climb begins with the half turn about z.
+    the identity. Climbs begin with the half turns about z and about axes around it: texels
+    steeper than the others can carry the mean normal many degrees away.
     """
-    half_turn = np.diag([-1.0, -1.0, 1.0])[None]
+    axes = _axes_around_z()
+    half_turns = 2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
     series = spectrum(target, target)
-    found = follow(series, np.zeros(1, np.int64), half_turn, AXIS_STEPS)[0][0]
+    rows = np.zeros(len(axes), np.int64)
+    turns, found = follow(series, rows, half_turns, AXIS_STEPS)
     # Half turns are 2 u u^T - I.
-    axis = np.linalg.eigh(found + found.T)[1][:, 2]
-    axis *= np.sign(axis[2]) or 1.0
-    if axis[2] < np.cos(LARGEST_AXIS_TILT):
+    axis = np.linalg.eigh(turns + np.swapaxes(turns, 1, 2))[1][:, :, 2]
+    axis *= np.where(axis[:, 2:] < 0, -1.0, 1.0)
+    near = axis[:, 2] >= np.cos(LARGEST_AXIS_TILT)
+    if not near.any():
         return np.eye(3)
-    return frames_from_normals(axis[None], np.array([[1.0, 0.0, 0.0]]))[0].T
+    best = axis[near][np.argmax(found[near, 0])]
+    return frames_from_normals(best[None], np.array([[1.0, 0.0, 0.0]]))[0].T
+
+
+def _axes_around_z() -> NDArray[np.float64]:
+    """The normal and two rings of axes around it, (19, 3)."""
+    rings = ((0.0, 1), (0.4, 6), (0.75, 12))
+    polar = np.repeat([r for r, _ in rings], [n for _, n in rings]) * LARGEST_AXIS_TILT
+    azimuth = np.concatenate([2.0 * np.pi * np.arange(n) / n for _, n in rings])
+    x, y = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
+    return np.stack([x, y, np.cos(polar)], axis=1)
 
 
 def _turn_target(target: Coupled, turn: NDArray[np.float64]) -> Coupled:

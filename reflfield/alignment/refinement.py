@@ -33,6 +33,7 @@ from reflfield.checks import check_shape
 from reflfield.errors import InputError
 
 LONGEST_STEP = np.deg2rad(4.0)
+SHORT_STEP = np.deg2rad(0.01)
 DAMPING = 1e-4
 BLOCK = 128
 # Parts that the samples are summed in: their sums are held together.
@@ -56,9 +57,9 @@ class RefinementOptions:
         Steps of conjugate gradients of the target fit per round. More let the target
         follow the wrong frames.
     steps : int
-        Gauss-Newton steps per round.
+        Gauss-Newton steps per round, at most.
     last_steps : int
-        Gauss-Newton steps of all texels against the finished targets.
+        Gauss-Newton steps of all texels against the finished targets, at most.
     floor : float
         Added to |sample| in the weight 1 / (floor + |sample|), relative to the
         texel's root mean square.
@@ -73,7 +74,7 @@ class RefinementOptions:
     rounds: int = 4
     fit_steps: int = 6
     steps: int = 2
-    last_steps: int = 2
+    last_steps: int = 6
     floor: float = 0.3
     texels_per_cluster: int = 1024
     spread: float = math.inf
@@ -348,6 +349,10 @@ def improve(
                 shrink(step, 4, 0.25)
             turn_frame(frames[i], step, turn, frame)
             scale_factor = np.exp(step[3])
+            if max(abs(step[0]), abs(step[1]), abs(step[2])) < SHORT_STEP:
+                # Too short to be worth an evaluation, but free to take.
+                copy_matrix(frame, frames[i])
+                break
 
 
 def fit_nodes(
