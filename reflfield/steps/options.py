@@ -104,7 +104,7 @@ class AlignmentOptions:
     band_limit: int = 8
     iterations: int = 4
     n_clusters: int = 1
-    refine: bool = False
+    refine: bool = True
     spread_deg: float = 1.0
     max_tilt_deg: float = 45.0
     least_margin: float = 0.0

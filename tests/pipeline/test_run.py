@@ -175,7 +175,7 @@ class TestSecondRun:
             ("visibility.grazing_cosine=0.3", "visibility", "completion"),
             ("alignment.iterations=2", "alignment", "alignment"),
             ("compression.n_clusters=1", "compression", "compression"),
-            ("alignment.refine=true", "alignment", "compression"),
+            ("alignment.refine=false", "alignment", "compression"),
             ("compression.samples.frame_spread_deg=0.0", "compression", "compression"),
             ("relighting.samples_per_pixel=4", "comparison", "report"),
         ],

@@ -19,7 +19,6 @@ from reflfield.comparison.report import (
     format_bytes,
 )
 from reflfield.comparison.sections.frames import (
-    FLIP_LABEL,
     METRIC_HEADER,
     ComparedRow,
     compared_row,
@@ -151,7 +150,7 @@ def _strip(variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]
         f"The frame with the middle gain of all. {metrics}. Look at the highlights and at fine "
         "relief: without alignment they smear.",
         title=rows[0].metrics.name,
-        colour_bar=ColourBar("magma", 0.0, high, FLIP_LABEL),
+        colour_bar=ColourBar("magma", 0.0, high, "FLIP error: 0 is not distinguishable"),
         min_width=0,
     )
 
