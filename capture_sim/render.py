@@ -29,6 +29,7 @@ from capture_sim.effects import (
     near_lights,
     shadows,
     simulated,
+    subsurface,
 )
 from capture_sim.materials import Material
 from capture_sim.model import Scene
@@ -49,7 +50,7 @@ RAYS_PER_BLOCK = 1 << 19
 # A jump along the ray within a pixel above this part of the object's radius is an edge.
 EDGE_STEP = 0.04
 # What light does between parts of the object, beyond shining on it.
-TRANSPORT_EFFECTS = (interreflection,)
+TRANSPORT_EFFECTS = (interreflection, subsurface)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from capture_sim.effects import (
     sensor_noise,
     shadows,
     simulated,
+    subsurface,
     vignetting,
 )
 from capture_sim.errors import scene_error
@@ -47,6 +48,7 @@ EFFECTS: tuple[Effect, ...] = (
     light_extent,
     environment,
     interreflection,
+    subsurface,
     vignetting,
     defocus,
     bayer,

@@ -15,11 +15,13 @@ from capture_sim.materials.base import Material
 from capture_sim.materials.rgl import read_rgl
 from capture_sim.materials.spatial import Mixed, SpatiallyVarying
 from capture_sim.materials.textures import Texture, make_texture
+from capture_sim.materials.translucent import Translucent
 from capture_sim.tables import Table, TableReader
 
 DEEPEST = 8  # materials within materials
 SMOOTHEST, ROUGHEST = 1e-4, 1.0
 LARGEST_EXPONENT = 1e6
+SHORTEST_LENGTH, LONGEST_LENGTH = 1e-7, 1e3  # metres
 
 # Refraction index and extinction coefficient at about 630, 530 and 465 nm, from
 # the tables of P. B. Johnson and R. W. Christy (1972) and A. D. Rakic (1995).
@@ -101,6 +103,13 @@ PRESETS: dict[str, dict[str, Any]] = {
             },
         ],
     },
+    "marble": {
+        "type": "translucent",
+        "albedo": [0.82, 0.78, 0.72],
+        "length": [0.006, 0.004, 0.003],
+        "refraction": 1.5,
+        "coat": {"type": "ggx", "specular": 0.04, "diffuse": 0.0, "alpha": 0.25},
+    },
     "greek_key": {
         "type": "mixed",
         "labels": {"type": "meander", "columns": 12, "rows": 8},
@@ -167,6 +176,8 @@ def make_material(
     textured              base (a material), tint, tangent_angle (radians),
                           normal_map, height, height_scale
     mixed                 materials (a list), labels
+    translucent           albedo, length (diffusion length, metres), refraction,
+                          coat (a material); the whole object, not part of another
     ====================  =====================================================
 
     Examples
@@ -310,6 +321,27 @@ def _textured(reader: _MaterialReader) -> Material:
     )
 
 
+def _translucent(reader: _MaterialReader) -> Material:
+    if reader.depth > 0:
+        raise scene_error(
+            reader.what, "a material of a surface", "translucent",
+            "make the whole object translucent: light crosses from one part to another",
+        )  # fmt: skip
+    albedo, length = reader.vector("albedo", (0.8,) * 3), reader.vector("length", (0.005,) * 3)
+    if not ((albedo >= 0.0) & (albedo < 1.0)).all():
+        raise scene_error(reader.name("albedo"), "values in [0, 1)", albedo.tolist())
+    if not ((length >= SHORTEST_LENGTH) & (length <= LONGEST_LENGTH)).all():
+        expected = f"values in [{SHORTEST_LENGTH:g}, {LONGEST_LENGTH:g}]"
+        raise scene_error(reader.name("length"), expected, length.tolist())
+    coat = reader.take("coat", {"type": "lambert", "albedo": 0.0})
+    return Translucent(
+        reader.material("coat", coat),
+        tuple(albedo.tolist()),
+        tuple(length.tolist()),
+        reader.number("refraction", 1.3, low=1.0, high=4.0),
+    )
+
+
 def _mixed(reader: _MaterialReader) -> Material:
     tables = reader.require("materials")
     if not isinstance(tables, list) or not 1 <= len(tables) <= 256:
@@ -328,4 +360,5 @@ _MAKERS: dict[str, Callable[[_MaterialReader], Material]] = {
     "mixed": _mixed,
     "rgl": _rgl,
     "textured": _textured,
+    "translucent": _translucent,
 }

@@ -66,7 +66,7 @@ def test_effects_can_be_forced(mode, traced):
 )
 def test_the_choice_decides(choice, expected):
     # The reference light is close: its irradiance more than doubles over the vase.
-    lights = {"preset": "rti", "distance": 0.2}
+    lights = {"preset": "rti", "distance": 0.2, "target": [0, 0, 0.1]}
     thing = parse_scene(
         {
             "object": {"preset": "vase"},

@@ -1,0 +1,354 @@
+r"""Light that enters a translucent body and leaves it elsewhere: the dipole, over the surface.
+
+The body sends to all sides the radiance
+
+.. math:: L(x) = \frac{1}{\pi} \int R(|x - y|)\, E(y)\, \mathrm{d}A_y,
+
+with the irradiance `E` by direct light and the profile `R` of `Dipole`. It depends on no
+viewer and is computed once for all of them, on nodes of a grid in every triangle; points in
+between take the mean of the nodes about them. Close to `x`, where `R` is steeper than the
+grid resolves, the surface is taken for flat and `E` for even.
+
+Limits: the dipole is that of a flat, thick, homogeneous medium, so that thin parts let too
+little light through and too much light crosses gaps; what enters and leaves is matte, its
+Fresnel terms are part of the albedo; light thrown by other parts of the object does not enter
+the body.
+
+References
+----------
+H. W. Jensen and J. Buhler, "A rapid hierarchical rendering technique for translucent
+materials", SIGGRAPH 2002 (irradiance on points of the surface first).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from capture_sim.arrival import LightArrays
+from capture_sim.effects import Cost, Decision, Stage, Workload, simulated
+from capture_sim.effects import shadows as shadows_effect
+from capture_sim.effects.bounds import pixels_per_metre
+from capture_sim.errors import scene_error
+from capture_sim.materials.translucent import Translucent
+from capture_sim.model import Scene
+from capture_sim.objects import SurfaceMesh
+from capture_sim.rays import RayTracer
+from capture_sim.shading import direct_light
+from capture_sim.surface import SurfacePoints, surface_points
+from capture_sim.tables import bounded
+from capture_sim.visibility import Nodes, TracedLights
+
+NAME = "subsurface"
+STAGE = Stage.TRANSPORT
+
+Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+# Where the profile has fallen to e^-9 of itself; less than 1e-3 of the light gets farther.
+REACH = 9.0
+# Nodes that cell sizes are refused beyond: their pairs would take hours.
+MOST_NODES = 200_000
+# Light of bodies that is kept for other views, of one scene.
+MOST_BYTES = 1 << 30
+# Pairs of nodes, and of node and light, at once.
+PAIRS_PER_BLOCK = 1 << 22
+# Values of the profile that are tabulated: a hundredth of the light's depth apart.
+TABLE = 1 << 13
+# The profile is replaced by its integral within so many steps of the grid.
+STEPS_NEARBY = 2.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """How finely the surface is cut.
+
+    Attributes
+    ----------
+    steps : float
+        Steps of the grid in the shortest diffusion length.
+    """
+
+    steps: float = bounded(3.0, low=0.5, high=100.0)
+
+
+def needed(scene: Scene) -> Decision:
+    """Bound the change: all that the body reflects, or the part of a pixel that light crosses.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is to be simulated.
+
+    Returns
+    -------
+    Decision
+    """
+    material = scene.material
+    if not isinstance(material, Translucent):
+        return Decision("the material is not translucent", 0.0)
+    reach = max(material.length)
+    crossed = min(1.0, REACH * reach * pixels_per_metre(scene))
+    reason = f"light gets {1e3 * reach:.2g} mm through the body (dipole)"
+    return Decision(reason, scene.brightness.headroom * max(material.albedo) * crossed)
+
+
+def cost(scene: Scene, work: Workload) -> Cost:
+    """Irradiance at the nodes, and exchange among those in reach of each other."""
+    if not isinstance(scene.material, Translucent):
+        return Cost()
+    nodes = len(Nodes.of(scene.mesh, _spacing(scene, scene.material)))
+    return Cost(rays=nodes * work.n_lights, operations=work.n_points * work.n_lights)
+
+
+def apply(
+    scene: Scene,
+    tracer: RayTracer,
+    points: SurfacePoints,
+    views: Array,
+    lights: LightArrays,
+    traced: TracedLights | None = None,
+) -> Float32:
+    """What scattering below the surface adds to that of a Lambertian body, or takes away.
+
+    Parameters
+    ----------
+    scene : Scene
+        Gives the material and decides on shadows.
+    tracer : RayTracer
+        Of the scene's mesh.
+    points : SurfacePoints
+        n points.
+    views : (n, 3) float64
+        Unit directions to the viewer, world.
+    lights : LightArrays
+    traced : TracedLights, optional
+        Visibility of these lights, if known.
+
+    Returns
+    -------
+    (n, 3, n_lights) float32
+        Radiance; all zero for materials that are not translucent.
+    """
+    change = np.zeros((len(points), 3, len(lights)), dtype=np.float32)
+    material = scene.material
+    if not isinstance(material, Translucent):
+        return change
+    nodes, body = _body_light(scene, tracer, material, lights)
+    _interpolate(points.face, points.barycentric, nodes.per_side, nodes.first, body, change)
+    _, strength = direct_light(scene, tracer, points, views, lights, traced)
+    lambert = np.array(material.albedo)[:, None] / np.pi * lights.colour.T
+    change -= (strength[:, None] * lambert).astype(np.float32)
+    return change
+
+
+_found: WeakKeyDictionary[RayTracer, dict[int, tuple[Nodes, Float32]]] = WeakKeyDictionary()
+_finding = threading.Lock()
+
+
+def _body_light(
+    scene: Scene, tracer: RayTracer, material: Translucent, lights: LightArrays
+) -> tuple[Nodes, Float32]:
+    """`_scattered`, kept as long as the tracer lives: all views share it."""
+    parts = (lights.place, lights.near, lights.colour, lights.axis, lights.exponent)
+    key = hash(
+        (
+            *(part.tobytes() for part in parts),
+            material,
+            scene.effects.get(Options),
+            simulated(scene, shadows_effect),
+        )
+    )
+    with _finding:
+        kept = _found.setdefault(tracer, {})
+        if key not in kept:
+            kept[key] = _scattered(scene, tracer, material, lights)
+            while len(kept) > 1 and sum(body.nbytes for _, body in kept.values()) > MOST_BYTES:
+                del kept[next(iter(kept))]  # the oldest
+        return kept[key]
+
+
+def _spacing(scene: Scene, material: Translucent) -> float:
+    return min(material.length) / scene.effects.get(Options).steps
+
+
+def _scattered(
+    scene: Scene, tracer: RayTracer, material: Translucent, lights: LightArrays
+) -> tuple[Nodes, Float32]:
+    """Nodes and the radiance of the body there, (n_nodes, 3, n_lights)."""
+    spacing = _spacing(scene, material)
+    nodes = Nodes.of(scene.mesh, spacing)
+    if len(nodes) > MOST_NODES:
+        raise scene_error(
+            "effects.subsurface.steps",
+            f"a grid of at most {MOST_NODES} nodes",
+            f"{len(nodes)} for a diffusion length of {min(material.length):g} m",
+            "lower steps, lengthen material.length, or switch the effect off",
+        )
+    face, barycentric = nodes.places()
+    points = surface_points(scene.mesh, material, face, barycentric)
+    shining = _irradiance(scene, tracer, points, lights)
+    area = node_areas(scene.mesh, nodes)
+    body = np.zeros((len(nodes), 3, len(lights)), dtype=np.float32)
+    for channel, dipole in enumerate(material.dipoles):
+        flux = (shining * lights.colour[:, channel]).astype(np.float32)
+        near = STEPS_NEARBY * spacing
+        inside = float(dipole.within(np.array(near)))
+        reach = REACH * dipole.length
+        table = dipole.profile(np.linspace(0.0, reach, TABLE)).astype(np.float32)
+        for block, others in _neighbours(points.position, reach):
+            weight = np.zeros((len(block), len(others)), dtype=np.float32)
+            taken = np.zeros(len(block))
+            _weigh(points.position, area, block, others, table, reach, near, weight, taken)
+            total = weight @ flux[others]
+            total += (inside - taken)[:, None].astype(np.float32) * flux[block]
+            body[block, channel] = np.maximum(total, 0.0) / np.pi
+    return nodes, body
+
+
+def _irradiance(
+    scene: Scene, tracer: RayTracer, points: SurfacePoints, lights: LightArrays
+) -> Array:
+    """Irradiance over the lights' colours, (n, n_lights)."""
+    shining = np.zeros((len(points), len(lights)))
+    step = max(1, PAIRS_PER_BLOCK // (16 * len(lights)))
+    for first in range(0, len(points), step):
+        block = slice(first, first + step)
+        here = points[block]
+        # Seen along the normal, every point counts.
+        views = here.shading_from_world[:, 2]
+        shining[block] = direct_light(scene, tracer, here, views, lights)[1]
+    return shining
+
+
+def node_areas(mesh: SurfaceMesh, nodes: Nodes) -> Array:
+    """Area that each node stands for, (n_nodes,): a third of the small triangles about it.
+
+    Examples
+    --------
+    >>> from capture_sim.objects import make_object
+    >>> plate = make_object({"preset": "flat_sample", "size": [0.2, 0.1]})
+    >>> round(float(node_areas(plate, Nodes.of(plate, 0.01)).sum()), 9)
+    0.02
+    """
+    corners = mesh.vertices[mesh.faces]
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    small = 0.5 * np.linalg.norm(doubled, axis=1) / nodes.per_side**2
+    areas = np.zeros(len(nodes))
+    _fill_areas(nodes.per_side, nodes.first, small, areas)
+    return areas
+
+
+def _neighbours(
+    positions: Array, reach: float
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Blocks of nodes close together, and all nodes in reach of any of them."""
+    tree = cKDTree(positions)
+    cells = np.floor(positions / reach).astype(np.int64)
+    order = np.lexsort(cells.T)
+    starts = np.flatnonzero(np.any(np.diff(cells[order], axis=0) != 0, axis=1)) + 1
+    for cell in np.split(order, starts):
+        centre = positions[cell].mean(axis=0)
+        radius = np.linalg.norm(positions[cell] - centre, axis=1).max()
+        others = np.array(tree.query_ball_point(centre, radius + reach), dtype=np.intp)
+        step = max(1, PAIRS_PER_BLOCK // len(others))
+        for first in range(0, len(cell), step):
+            yield cell[first : first + step], others
+
+
+_compiled = numba.njit(cache=True, nogil=True)
+_Values = NDArray[Any]
+
+
+@_compiled
+def _weigh(
+    positions: _Values,
+    area: _Values,
+    block: _Values,
+    others: _Values,
+    table: _Values,
+    reach: float,
+    near: float,
+    weight: _Values,
+    taken: _Values,
+) -> None:
+    """Profile, from a table over [0, reach], times area for pairs of nodes in reach.
+
+    `taken` is the sum over those that are near.
+    """
+    scale = (len(table) - 1) / reach
+    for n in range(len(block)):
+        x, y, z = positions[block[n]]
+        for m in range(len(others)):
+            at = positions[others[m]]
+            squared = (at[0] - x) ** 2 + (at[1] - y) ** 2 + (at[2] - z) ** 2
+            if squared >= reach * reach:
+                continue
+            distance = np.sqrt(squared)
+            place = distance * scale
+            i = min(int(place), len(table) - 2)
+            t = place - i
+            value = ((1.0 - t) * table[i] + t * table[i + 1]) * area[others[m]]
+            weight[n, m] = value
+            if distance < near:
+                taken[n] += value
+
+
+@_compiled
+def _fill_areas(per_side: _Values, first: _Values, small: _Values, areas: _Values) -> None:
+    """A third of the area of each of the k^2 small triangles to its three nodes."""
+    for face in range(len(per_side)):
+        k = per_side[face]
+        third = small[face] / 3.0
+        at = first[face]
+        for i in range(k + 1):
+            for j in range(k + 1 - i):
+                # Triangles about a node: 6 inside, 3 on an edge, 1 at a corner.
+                on_edges = int(i == 0) + int(j == 0) + int(i + j == k)
+                n_about = 6 if on_edges == 0 else (3 if on_edges == 1 else 1)
+                areas[at] = n_about * third
+                at += 1
+
+
+@_compiled
+def _interpolate(
+    face: _Values,
+    barycentric: _Values,
+    per_side: _Values,
+    first: _Values,
+    values: _Values,
+    result: _Values,
+) -> None:
+    """Linear interpolation of node values (n_nodes, 3, n_lights) in the small triangles."""
+    for n in range(len(face)):
+        k = per_side[face[n]]
+        x = min(max(barycentric[n, 1], 0.0), 1.0) * k
+        y = min(max(barycentric[n, 2], 0.0), 1.0) * k
+        i = min(int(x), k - 1)
+        j = min(int(y), k - 1 - i)
+        tx, ty = x - i, y - j
+        start = first[face[n]]
+        right = start + (i + 1) * (k + 1) - (i + 1) * i // 2 + j
+        above = start + i * (k + 1) - i * (i - 1) // 2 + j + 1
+        if tx + ty > 1.0 and i + j < k - 1:
+            # The small triangle of the three far corners, seen from its own corner.
+            third, w3 = right + 1, tx + ty - 1.0
+            w1, w2 = 1.0 - ty, 1.0 - tx
+        else:
+            third, w3 = above - 1, 1.0 - tx - ty
+            w1, w2 = tx, ty
+        for c in range(values.shape[1]):
+            for light in range(values.shape[2]):
+                result[n, c, light] += (
+                    w1 * values[right, c, light]
+                    + w2 * values[above, c, light]
+                    + w3 * values[third, c, light]
+                )
