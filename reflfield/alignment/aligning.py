@@ -8,9 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.alignment.expectation import TargetFit, fit_targets, mean_targets
-from reflfield.alignment.gauge import Gauged, fix_gauge, fold, turn_targets
+from reflfield.alignment.gauge import Gauged, fix_gauge, fold, turn_targets, turns_are_open
 from reflfield.alignment.horizon import Horizon, extend_targets, settle
-from reflfield.alignment.materials import Materials, choose, one_round, spread_rows, tell_apart
+from reflfield.alignment.materials import (
+    Materials,
+    choose,
+    one_round,
+    spread_rows,
+    tell_apart,
+)
 from reflfield.alignment.refinement import (
     RefinementOptions,
     SampleSet,
@@ -31,6 +37,7 @@ from reflfield.alignment.searching import (
     search,
 )
 from reflfield.alignment.splines import NodeTargets
+from reflfield.alignment.turning import best_turns, find_turns, turn_margin
 from reflfield.checks import unit_directions
 from reflfield.errors import InputError, ShapeError
 from reflfield.progress import track
@@ -47,6 +54,8 @@ TRAINING_BYTES = 256 * 2**20
 PROJECTION_BLOCK = 128
 # Rounds of filling in what lies below the base horizon: each leaves about a third of the error.
 EXTENSIONS = 3
+# Turns about the normal and normals of a texel are improved in turn so often.
+TURN_PASSES = 3
 # Samples kept for the targets of the refinement.
 REFINING_BYTES = 256 * 2**20
 
@@ -66,7 +75,8 @@ class Alignment:
         Normalised correlation with the cluster's target, -1 .. 1; 0 where nothing is observed.
     margin : (n,) float64
         Score gap to the best rotation at least 15 degrees away. Near 0: the frame is not
-        determined (a round lobe, a constant).
+        determined (a round lobe, a constant). Where only the samples tell the turn about the
+        normal, the gap to the best other turn, on the samples.
     history : (k,) float64
         Accumulated correlation of the training texels per iteration, over the largest
         possible. Never falls.
@@ -188,7 +198,7 @@ def align(
             view = _RefiningView.of(task, rows, training, refinement, n_clusters)
             if n_clusters > 1:
                 fit, aims = _divide(task, view, training, fit, n_clusters, iterations, rng)
-            sharp = _sharpen(task, view, fit)
+            sharp = _sharpen(task, view, fit, aims)
         # Find the frames of all texels, block by block.
         return _finish(task, rows, fit, aims, sharp)
 
@@ -321,33 +331,58 @@ def _divide(
 
 @dataclass(frozen=True, eq=False)
 class _Sharp:
-    """Targets on samples, in the gauge of the harmonic targets; `regauged` follows both."""
+    """Targets on samples, in the gauge of the harmonic targets; `regauged` follows both.
+
+    `turned` is True for clusters whose turns about the normal were found on the samples.
+    """
 
     targets: NodeTargets
     options: RefinementOptions
     regauged: Gauged
+    turned: NDArray[np.bool_]
 
 
-def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit) -> _Sharp:
+def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit, aims: _Aims) -> _Sharp:
     """Refine some training texels, and fix the gauge again from their better frames."""
     data, options, n_clusters = view.data, view.options, len(fit.targets)
     frames = np.ascontiguousarray(np.swapaxes(fit.found.rotations[view.some], 1, 2))
     cluster, score = fit.found.cluster[view.some], fit.found.score[view.some]
     targets, frames = refine_targets(data, frames, cluster, n_clusters, options, task.n_threads)
+    state = Materials(targets, frames, data.brightness(), cluster)
     if n_clusters > 1:
-        state = Materials(targets, frames, data.brightness(), cluster)
-        state = one_round(
-            data,
-            choose(data, state, options, options.steps, task.n_threads),
-            options,
-            task.n_threads,
-        )
-        targets, frames, cluster = state.targets, state.frames, state.cluster
-    rotations = np.ascontiguousarray(np.swapaxes(frames, 1, 2))
-    better = SearchResult(rotations, score, np.zeros(len(score)), cluster)
+        state = choose(data, state, options, options.steps, task.n_threads)
+        state = one_round(data, state, options, task.n_threads)
+    turned = np.array([_turn_cluster(task, view, state, aims, k) for k in range(n_clusters)])
+    for _ in range(options.rounds if turned.any() else 0):
+        state = one_round(data, state, options, task.n_threads)
+    rotations = np.ascontiguousarray(np.swapaxes(state.frames, 1, 2))
+    better = SearchResult(rotations, score, np.zeros(len(score)), state.cluster)
     weights = np.where(data.brightness() > 0, np.maximum(score, 0.0), 0.0)
     means = mean_targets(view.training, weights, better, n_clusters)
-    return _Sharp(targets, options, fix_gauge(means, rotations, cluster, weights))
+    regauged = fix_gauge(means, rotations, state.cluster, weights, turned.tolist())
+    return _Sharp(state.targets, options, regauged, turned)
+
+
+def _turn_cluster(
+    task: _Task, view: _RefiningView, state: Materials, aims: _Aims, k: int
+) -> bool:
+    """Find the turns of one cluster on the samples if harmonics leave them open, in place."""
+    mine = np.flatnonzero((state.cluster == k) & (state.brightness > 0))
+    rotations = np.swapaxes(state.frames[mine], 1, 2)
+    is_round = aims.extended.symmetries[k].kind == "all"
+    if not (is_round or turns_are_open(rotations, np.ones(len(mine)))) or len(mine) < 2:
+        return False
+    t = state.targets
+    own = Materials(
+        NodeTargets(t.values[k : k + 1].copy(), t.view_side, t.light_side),
+        state.frames[mine],
+        state.brightness[mine],
+        np.zeros(len(mine), np.int32),
+    )
+    found, known = find_turns(view.data.part(mine), own, view.options, task.n_threads)
+    t.values[k] = found.targets.values[0]
+    state.frames[mine], state.brightness[mine] = found.frames, found.brightness
+    return known
 
 
 def _projector(
@@ -488,7 +523,13 @@ def _refine_block(
     frames = np.ascontiguousarray(np.swapaxes(found.rotations[part], 1, 2))
     before = found.cluster[part]
     state = Materials(sharp.targets, frames, data.brightness(), before)
-    state = choose(data, state, sharp.options, sharp.options.last_steps, task.n_threads)
+    state = choose(
+        data,
+        _turned(task, data, state, sharp),
+        sharp.options,
+        sharp.options.last_steps,
+        task.n_threads,
+    )
     found.cluster[part] = state.cluster
     turns = sharp.regauged.turns[state.cluster]
     found.rotations[part] = np.swapaxes(state.frames, 1, 2) @ turns
@@ -497,6 +538,28 @@ def _refine_block(
         mine = (state.cluster == k) & (before != k)
         again = _search(task, couple_samples(task, samples[mine]), aims.only(int(k)))
         found.score[part[mine]], found.margin[part[mine]] = again.score, again.margin
+    for k in np.flatnonzero(sharp.turned):
+        mine = np.flatnonzero(state.cluster == k)
+        half_turn = sharp.regauged.symmetries[k].kind == "half"
+        found.margin[part[mine]] = turn_margin(
+            data.part(mine), state.part(mine), sharp.options.floor, half_turn, task.n_threads
+        )
+
+
+def _turned(task: _Task, data: SampleSet, state: Materials, sharp: _Sharp) -> Materials:
+    """State with the best turns of texels whose cluster's are found on the samples.
+
+    Normals that are some degrees off hide the right turn, so both are found in turn.
+    """
+    turned = np.flatnonzero(sharp.turned[state.cluster])
+    if len(turned) == 0:
+        return state
+    few, own, options = data.part(turned), state.part(turned), sharp.options
+    for _ in range(TURN_PASSES):
+        own = best_turns(few, own, options.floor, task.n_threads)
+        own = choose(few, own, options, options.steps, task.n_threads)
+    state.frames[turned], state.brightness[turned] = own.frames, own.brightness
+    return state
 
 
 def _fold_all(

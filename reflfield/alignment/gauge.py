@@ -11,6 +11,7 @@ half turn leaves unchanged.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
 from reflfield.alignment.searching import rotation_about
-from reflfield.sphere.coupling import Coupled, rotate_coupled
+from reflfield.sphere.coupling import Coupled, rotate_coupled, uncouple
 from reflfield.sphere.rotations import frames_from_normals
 from reflfield.sphere.wigner import rotation_blocks
 
@@ -28,6 +29,9 @@ ISOTROPIC_SHARE = 0.01
 # Odd orders of a target with a half-turn symmetry vanish; what the horizon cuts off steep
 # texels leaves a sixth of the even ones, and up to a third where there are many.
 HALF_TURN_SHARE = 0.5
+# Frames share no turn where the mean frame's second singular value is below this share of the
+# first: tilts of 60 degrees with a common turn leave more than half.
+OPEN_SHARE = 0.3
 AXIS_STEPS = 20
 # A symmetry axis farther from the mean normal is not the normal.
 LARGEST_AXIS_TILT = np.deg2rad(40.0)
@@ -40,8 +44,10 @@ class Symmetry:
     kind: str
 
 
-def symmetry_about_normal(target: Coupled) -> Symmetry:
+def symmetry_about_normal(target: Coupled, turn_known: bool = False) -> Symmetry:
     """Symmetry of one target whose normal is z, from its energy per order.
+
+    A target whose turn is known is not round, however small the energy that varies.
 
     Examples
     --------
@@ -56,7 +62,7 @@ def symmetry_about_normal(target: Coupled) -> Symmetry:
         energy[: j + 1] += by_order[j:]
         energy[1 : j + 1] += by_order[:j][::-1]
     varying, odd = energy[1:].sum(), energy[1::2].sum()
-    if varying <= ISOTROPIC_SHARE * energy.sum():
+    if not turn_known and varying <= ISOTROPIC_SHARE * energy.sum():
         return Symmetry("all")
     if odd <= HALF_TURN_SHARE * (varying - odd):
         return Symmetry("half")
@@ -121,6 +127,35 @@ def fold(rotations: NDArray[np.float64], symmetry: Symmetry) -> NDArray[np.float
     return rotations @ rotation_about(axes, undo)
 
 
+def turns_are_open(rotations: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
+    """Whether frames share no turn about the normal, only (on average) the normal.
+
+    Examples
+    --------
+    >>> about = rotation_about(np.tile([0.0, 0.0, 1.0], (4, 1)), np.arange(4) * np.pi / 2)
+    >>> turns_are_open(about, np.ones(4)), turns_are_open(about[:1], np.ones(1))
+    (True, False)
+    """
+    shares = np.linalg.svd(np.einsum("n,nij->ij", weights, rotations))[1]
+    return bool(shares[1] < OPEN_SHARE * shares[0])
+
+
+def _turn_to_light(target: Coupled) -> NDArray[np.float64]:
+    """Rotation whose z is the target's mean light direction, its view's if that is constant.
+
+    Light falls in by its cosine from one side only, so the mean direction of what is
+    reflected is the normal for every reflectance that has a half turn or is round.
+    """
+    coefficients = uncouple(target)[0]
+    moment = coefficients[0, 1:4] if coefficients.shape[1] > 1 else coefficients[1:4, 0]
+    # Real harmonics of degree 1 are in the order y, z, x.
+    axis = moment[[2, 0, 1]].astype(np.float64)
+    length = np.linalg.norm(axis)
+    if not length > 0:
+        return np.eye(3)
+    return frames_from_normals(axis[None] / length, np.array([[1.0, 0.0, 0.0]]))[0].T
+
+
 def _gauge_turn(
     rotations: NDArray[np.float64], weights: NDArray[np.float64], symmetry: Symmetry
 ) -> NDArray[np.float64]:
@@ -158,6 +193,7 @@ def fix_gauge(
     rotations: NDArray[np.float64],
     cluster: NDArray[np.int32],
     weights: NDArray[np.float64],
+    turns_known: Sequence[bool] = (),
 ) -> Gauged:
     """Turn each target so that its frames are on average the base frames.
 
@@ -170,6 +206,9 @@ def fix_gauge(
     cluster : (n,) int32
     weights : (n,) float64
         Of the frames in the average.
+    turns_known : sequence of bool
+        True for each target whose turn about the normal was found by other means: it is not
+        round, however little it varies. Empty: none.
 
     Returns
     -------
@@ -182,9 +221,13 @@ def fix_gauge(
         mine = (cluster == k) & (weights > 0)
         kind = Symmetry("none")
         if mine.any():
+            known = bool(turns_known) and turns_known[k]
             turns[k] = mean_rotation(rotations[mine], weights[mine]).T
+            if not known and turns_are_open(rotations[mine], weights[mine]):
+                # Turns may follow the tilts; then the mean frame leans that way.
+                turns[k] = _turn_to_light(targets[k : k + 1])
             upright = turns[k] @ _normal_first(_turn_target(targets[k : k + 1], turns[k]))
-            kind = symmetry_about_normal(_turn_target(targets[k : k + 1], upright))
+            kind = symmetry_about_normal(_turn_target(targets[k : k + 1], upright), known)
             turns[k] = turns[k] if kind.kind == "none" else upright
             turns[k] = turns[k] @ _gauge_turn(rotations[mine] @ turns[k], weights[mine], kind)
             rotations[cluster == k] = fold(rotations[cluster == k] @ turns[k], kind)

@@ -373,7 +373,7 @@ def tell_apart(
     Materials
     """
     few = spread_rows(len(frames), max(TEXELS_PER_CLUSTER * n_clusters, LEAST_TEXELS))
-    work = _Work(_thinned(data.part(few)), options, rng, n_threads)
+    work = _Work(thinned(data.part(few)), options, rng, n_threads)
     targets = _divided(work, frames[few], n_clusters)
     everyone = Materials(
         targets, frames.copy(), data.brightness(), np.zeros(len(frames), np.int32)
@@ -386,7 +386,7 @@ def spread_rows(n: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, n - 1, min(n, most)).astype(np.int64))
 
 
-def _thinned(data: SampleSet) -> SampleSet:
+def thinned(data: SampleSet) -> SampleSet:
     """Every so many views of each texel: enough samples to choose among materials."""
     n_views, n_lights = data.samples.shape[1:]
     stride = max(1, n_views * n_lights // ENOUGH_SAMPLES)
@@ -408,23 +408,17 @@ def _divided(work: _Work, frames: NDArray[np.float64], n_clusters: int) -> NodeT
         np.zeros(len(frames), np.int32),
     )
     state = _rounds(work, state, FIRST_ROUNDS)
-    objective = _objective(work, state)
+    objective = work.objective(state)
     for _ in range(n_clusters - 1 + MOST_EXCHANGES):
         moved = _one_move(work, state)
         if moved is None:
             break
         moved = _rounds(work, moved, ROUNDS_PER_SPLIT)
-        reached = _objective(work, moved)
+        reached = work.objective(moved)
         if reached >= objective:
             break
         state, objective = moved, reached
     return _rounds(work, state, LAST_ROUNDS).targets
-
-
-def _objective(work: _Work, state: Materials) -> float:
-    """Mean log distance of the texels to their own targets."""
-    distance = own_misfit(work.data, state, work.options.floor, work.n_threads)
-    return float(np.mean(np.log(distance + FORGIVEN)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -435,6 +429,10 @@ class _Work:
     options: RefinementOptions
     rng: np.random.Generator
     n_threads: int
+
+    def objective(self, state: Materials) -> float:
+        """What divisions must lower."""
+        return mean_log_misfit(self.data, state, self.options.floor, self.n_threads)
 
 
 def _rounds(work: _Work, state: Materials, n_rounds: int) -> Materials:
@@ -596,6 +594,13 @@ def own_misfit(
         one = NodeTargets(t.values[k : k + 1], t.view_side, t.light_side)
         out[mine] = misfits(data.part(mine), state.frames[mine], one, floor, n_threads)[:, 0]
     return out
+
+
+def mean_log_misfit(data: SampleSet, state: Materials, floor: float, n_threads: int) -> float:
+    """Mean over the texels of the log distance to their own targets; as `misfits`."""
+    seen = state.brightness > 0
+    distance = own_misfit(data, state, floor, n_threads)[seen]
+    return float(np.log(distance + FORGIVEN).sum() / max(len(distance), 1))
 
 
 def _two_groups(

@@ -1,0 +1,119 @@
+"""Turns about the normal that only the samples tell."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from reflfield.alignment import RefinementOptions, align
+from reflfield.alignment.gauge import fix_gauge, turns_are_open
+from reflfield.alignment.materials import Materials
+from reflfield.alignment.refinement import SampleSet
+from reflfield.alignment.splines import NodeTargets
+from reflfield.alignment.turning import N_TURNS, best_turns, turn_margin, turn_misfits
+from reflfield.sphere.coupling import couple
+from reflfield.sphere.hemisphere import HemisphereGrid
+from reflfield.sphere.projection import Projector
+
+QUICK = RefinementOptions(side=13, rounds=3, last_steps=3)
+
+
+def frames_of_any_turn(rng, n, tilt):
+    """Tilts uniform in angle up to `tilt` degrees, any azimuth, any turn."""
+    azimuth, turn = rng.uniform(0, 2 * np.pi, (2, n))
+    angles = np.stack([azimuth, rng.uniform(0, np.deg2rad(tilt), n), turn - azimuth], axis=1)
+    return np.swapaxes(Rotation.from_euler("ZYZ", angles).as_matrix(), 1, 2)
+
+
+def leaning(local, lean):
+    """(n, k, k) samples of a dull surface whose pile leans along x."""
+    up = local[..., 2]
+    seen = (up > 0)[:, :, None] & (up > 0)[:, None, :]
+    both = local[..., 0][:, :, None] + local[..., 0][:, None, :]
+    return np.where(seen, (1.0 + lean * both) * up[:, None, :], 0.0).astype(np.float32)
+
+
+def errors_less_common_turn(found, truth):
+    """Normal and turn errors in degrees after the common turn that fits best."""
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", truth, found))
+    between = (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt) @ found @ truth.swapaxes(1, 2)
+    normal = np.arctan2(np.hypot(between[:, 0, 2], between[:, 1, 2]), between[:, 2, 2])
+    turn = np.arctan2(between[:, 0, 1] - between[:, 1, 0], between[:, 0, 0] + between[:, 1, 1])
+    return np.rad2deg(normal), np.rad2deg(np.abs(turn))
+
+
+def test_turns_of_a_leaning_pile_are_found(scene, rng):
+    d = scene.dome_directions()
+    truth = frames_of_any_turn(rng, 100, 45.0)
+    samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.3)
+    found = align(samples, d, d, refine=QUICK, n_threads=2)
+    assert found.symmetries == ("none",)
+    normal, turn = errors_less_common_turn(found.local_from_base, truth)
+    # The harmonic search leaves several degrees; turns at random would be off by 90.
+    assert np.median(normal) < 1.5
+    assert np.median(turn) < 5.0
+    assert found.margin.max() > 0.0
+
+
+def test_round_reflectance_keeps_the_turn_of_the_base_frame(scene, rng):
+    d = scene.dome_directions()
+    truth = frames_of_any_turn(rng, 60, 45.0)
+    samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.0)
+    found = align(samples, d, d, refine=QUICK, n_threads=2)
+    assert found.symmetries == ("all",)
+    frames = found.local_from_base
+    # The turn nearest to the base frame leaves no antisymmetric part in the tangent plane.
+    assert np.abs(frames[:, 0, 1] - frames[:, 1, 0]).max() < 1e-6
+
+
+@pytest.fixture
+def known_state(scene, rng):
+    """Twenty upright texels of a leaning pile, each turned by a multiple of 15 degrees."""
+    d = scene.dome_directions()
+    steps = rng.integers(0, N_TURNS, 20)
+    angle = 2 * np.pi * steps / N_TURNS
+    truth = Rotation.from_rotvec(angle[:, None] * np.array([0.0, 0.0, 1.0])).as_matrix()
+    samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.4)
+    # The pile is linear in the directions, which bilinear nodes hold nearly exactly.
+    side = 25
+    nodes = HemisphereGrid(side).directions[None]
+    values = leaning(np.where(nodes == 0, 1e-9, nodes), 0.4)
+    start = np.tile(np.eye(3), (20, 1, 1))
+    data = SampleSet(samples, d, d)
+    cluster = np.zeros(20, np.int32)
+    return (
+        data,
+        Materials(NodeTargets(values, side, side), start, data.brightness(), cluster),
+        truth,
+    )
+
+
+def test_best_of_all_turns_is_the_true_one(known_state):
+    data, state, truth = known_state
+    found = best_turns(data, state, 0.3, 1)
+    np.testing.assert_allclose(found.frames, truth, atol=1e-12)
+    misfit = turn_misfits(data, found, 0.3, 1)
+    assert misfit.shape == (20, N_TURNS)
+    assert np.all(np.argmin(misfit, axis=1) == 0)
+
+
+def test_margin_is_positive_at_the_best_turn_and_zero_elsewhere(known_state):
+    data, state, truth = known_state
+    right = Materials(state.targets, truth, state.brightness, state.cluster)
+    assert turn_margin(data, right, 0.3, False, 1).min() > 1e-3
+    away = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix() @ truth
+    wrong = Materials(state.targets, away, state.brightness, state.cluster)
+    assert np.array_equal(turn_margin(data, wrong, 0.3, False, 1), np.zeros(20))
+
+
+def test_gauge_finds_the_normal_when_turns_follow_the_tilts(scene, rng):
+    """Frames whose tilts all lean to the same local side: their mean is not upright."""
+    d = scene.dome_directions()
+    target = couple(Projector(d, d, (6, 6)).project(leaning(d[None], 0.2))).units()
+    azimuth, tilt = rng.uniform(0, 2 * np.pi, 500), rng.uniform(0, np.pi / 3, 500)
+    base_from_local = Rotation.from_euler("ZY", np.stack([azimuth, tilt], axis=1)).as_matrix()
+    assert turns_are_open(base_from_local, np.ones(500))
+    cluster = np.zeros(500, np.int32)
+    gauged = fix_gauge(target, base_from_local, cluster, np.ones(500))
+    lean = np.arccos(np.sum(gauged.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
+    # The pile leans the mean light by a few degrees, the mean frame by thirty.
+    assert np.rad2deg(lean).max() < 8.0

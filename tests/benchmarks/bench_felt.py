@@ -1,0 +1,176 @@
+"""A measured felt turned by known rotations: error of the recovered frames, by margin.
+
+    python tests/benchmarks/bench_felt.py --texels 1000 --tilt 60 --noise 0.02
+
+Data: texel mean of the felt `felt05` of UBO2014 (Weinmann, Gall and Klein, ECCV 2014) on the
+151 x 151 directions of the Bonn dome, found under REFLFIELD_DATA or ../shared/data. It is
+turned through thin-plate splines of the logarithm of the reflectance, one in the view and
+one in the light: smooth, exact at the measured directions, and unrelated to both the
+harmonics and the bilinear nodes of the aligner. Beyond the last measured ring (75 degrees) the
+reflectance is that of the ring. What a texel's own horizon hides is 0.
+
+Prints errors after the harmonic search and after the refinement, with time and peak
+memory. All frames of one target may be turned in common, so errors are given as found and less
+the common turn that fits best.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial.transform import Rotation
+
+from reflfield.alignment import RefinementOptions, align
+
+LAST_RING = np.deg2rad(75.0)
+
+
+def measured(folder):
+    """(151, 3) directions and (views, lights) reflectance without the light's cosine."""
+    directions = np.fromfile(folder / "xyz_loc.bin").reshape(4, 151)[:3].T
+    log_mean = np.fromfile(folder / "felt05_mean_std.bin").reshape(2, 151, 151)[0]
+    # The file holds a third of log(Y) + log(U) + log(V); the felt is nearly grey.
+    luminance = np.exp(3.0 * log_mean)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions, luminance / directions[:, 2]
+
+
+class Felt:
+    """The measured reflectance as a smooth function of two directions."""
+
+    def __init__(self, directions, reflectance):
+        self.spline = RBFInterpolator(
+            directions, np.eye(len(directions)), kernel="thin_plate_spline"
+        )
+        self.log = np.log(reflectance)
+
+    def shares(self, directions):
+        """(n, 151) weights of the measured directions; those beyond the last ring are its."""
+        polar = np.minimum(np.arccos(np.clip(directions[:, 2], -1, 1)), LAST_RING)
+        azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+        ring = np.sin(polar)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        return self.spline(np.concatenate([ring, np.cos(polar)[:, None]], axis=1))
+
+    def samples(self, local):
+        """(n, k, k) samples with the light's cosine at local directions (n, k, 3)."""
+        n, k, _ = local.shape
+        shares = self.shares(local.reshape(-1, 3)).reshape(n, k, -1)
+        values = np.exp(shares @ self.log @ np.swapaxes(shares, 1, 2))
+        up = local[..., 2]
+        seen = (up > 0)[:, :, None] & (up > 0)[:, None, :]
+        return np.where(seen, values * up[:, None, :], 0.0).astype(np.float32)
+
+
+def leave_one_out(directions, reflectance):
+    """Root mean square relative error of the spline at each direction left out of it."""
+    errors = []
+    for i in range(len(directions)):
+        rest = np.arange(len(directions)) != i
+        spline = RBFInterpolator(
+            directions[rest], np.log(reflectance[:, rest]).T, kernel="thin_plate_spline"
+        )
+        errors.append(spline(directions[i : i + 1])[0] - np.log(reflectance[:, i]))
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def random_frames(rng, n, tilt):
+    """Frames with tilts uniform in angle up to `tilt`, any azimuth, any turn."""
+    azimuth, turn = rng.uniform(0, 2 * np.pi, (2, n))
+    angles = np.stack([azimuth, rng.uniform(0, tilt, n), turn - azimuth], axis=1)
+    return np.swapaxes(Rotation.from_euler("ZYZ", angles).as_matrix(), 1, 2)
+
+
+def frame_errors(found, truth):
+    """Angles between normals, and turns about the normal that are left, degrees."""
+    between = found @ np.swapaxes(truth, 1, 2)
+    normal = np.arctan2(np.hypot(between[:, 0, 2], between[:, 1, 2]), between[:, 2, 2])
+    turn = np.arctan2(
+        between[:, 0, 1] - between[:, 1, 0], between[:, 0, 0] + between[:, 1, 1]
+    )
+    return np.rad2deg(normal), np.rad2deg(np.abs(turn))
+
+
+def without_common_turn(found, truth):
+    """Found frames less the turn of all that brings them closest to the truth (robustly)."""
+    turn = np.eye(3)
+    for _ in range(20):
+        between = np.einsum("ij,njk,nlk->nil", turn, found, truth)
+        angle = Rotation.from_matrix(between).magnitude()
+        weights = 1.0 / np.maximum(angle, np.deg2rad(0.2))
+        total = np.einsum("n,nij,nkj->ik", weights, truth, found)
+        u, _, vt = np.linalg.svd(total)
+        turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return turn @ found
+
+
+def report(name, seconds, result, truth):
+    """One stage: errors, and the errors by margin."""
+    for label, frames in (
+        ("as found", result.local_from_base),
+        ("less the common turn", without_common_turn(result.local_from_base, truth)),
+    ):
+        normal, turn = frame_errors(frames, truth)
+        print(
+            f"{name:9s} {seconds:6.1f} s  {label:21s} degrees: normal median "
+            f"{np.median(normal):.2f} mean {normal.mean():.2f} 95 % "
+            f"{np.percentile(normal, 95):.2f}   turn median {np.median(turn):.2f} 95 % "
+            f"{np.percentile(turn, 95):.2f}"
+        )
+    print(f"          symmetry {result.symmetries[0]}; errors by margin:")
+    print("          margin              texels  normal median   95 %   turn median   95 %")
+    edges = np.quantile(result.margin, [0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0])
+    for low, high in itertools.pairwise(edges):
+        mine = (result.margin >= low) & (result.margin <= high)
+        print(
+            f"          {low:.5f} - {high:.5f} {mine.sum():7d} {np.median(normal[mine]):12.2f}"
+            f" {np.percentile(normal[mine], 95):8.2f} {np.median(turn[mine]):11.2f}"
+            f" {np.percentile(turn[mine], 95):8.2f}"
+        )
+
+
+def main() -> None:
+    """Print the errors of both stages."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--texels", type=int, default=1000)
+    parser.add_argument("--tilt", type=float, default=60.0, help="largest, degrees")
+    parser.add_argument("--noise", type=float, default=0.02, help="share of the deviation")
+    parser.add_argument("--rounds", type=int, default=RefinementOptions().rounds)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    root = Path(os.environ.get("REFLFIELD_DATA", "../shared/data")) / "ubo2014_felt05"
+    if not root.exists():
+        raise SystemExit(f"{root} not found: set REFLFIELD_DATA to the folder of the test data")
+    directions, reflectance = measured(root)
+    print(
+        f"spline at a direction left out: {100 * leave_one_out(directions, reflectance):.1f} %"
+    )
+    rng = np.random.default_rng(5)
+    truth = random_frames(rng, options.texels, np.deg2rad(options.tilt))
+    local = np.einsum("nij,kj->nki", truth, directions)
+    felt = Felt(directions, reflectance)
+    blocks = np.array_split(np.arange(options.texels), max(1, options.texels // 64))
+    samples = np.concatenate([felt.samples(local[rows]) for rows in blocks])
+    samples += options.noise * samples.std() * rng.standard_normal(samples.shape, np.float32)
+    align(samples[:2], directions, directions)  # compile before the clock starts
+    for name, refine in (
+        ("harmonic", False),
+        ("refined", RefinementOptions(rounds=options.rounds)),
+    ):
+        start = time.perf_counter()
+        result = align(
+            samples, directions, directions, refine=refine, n_threads=options.threads
+        )
+        report(name, time.perf_counter() - start, result, truth)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"peak memory {peak:.2f} GB, of which samples {samples.nbytes / 2**30:.2f} GB")
+
+
+if __name__ == "__main__":
+    main()
