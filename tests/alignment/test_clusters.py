@@ -12,7 +12,7 @@ from reflfield.sphere.hemisphere import LOWEST_Z
 from reflfield.sphere.rotations import frames_from_normals
 
 # Coarser and shorter than the default, so that each test takes seconds.
-QUICK = RefinementOptions(side=13, rounds=2, last_steps=2)
+QUICK = RefinementOptions(side=17, rounds=3, last_steps=2)
 SIMILAR = ({"nu": 8.0, "nv": 60.0}, {"nu": 12.0, "nv": 60.0})
 FAR_APART = (
     {"nu": 8.0, "nv": 60.0},
@@ -53,7 +53,7 @@ def agreement(found, label):
 
 @pytest.mark.parametrize("materials", [SIMILAR, FAR_APART], ids=["similar", "far apart"])
 def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene, rng):
-    frames, d, samples, label = mixture(scene, rng, materials, 40 * len(materials))
+    frames, d, samples, label = mixture(scene, rng, materials, 60 * len(materials))
     found = align(samples, d, d, n_clusters=len(materials), refine=QUICK, n_threads=2)
     assert agreement(found.cluster, label) >= 0.99
     errors = scene.frame_errors(found.local_from_base, frames)[0]

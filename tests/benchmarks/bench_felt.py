@@ -91,9 +91,7 @@ def frame_errors(found, truth):
     """Angles between normals, and turns about the normal that are left, degrees."""
     between = found @ np.swapaxes(truth, 1, 2)
     normal = np.arctan2(np.hypot(between[:, 0, 2], between[:, 1, 2]), between[:, 2, 2])
-    turn = np.arctan2(
-        between[:, 0, 1] - between[:, 1, 0], between[:, 0, 0] + between[:, 1, 1]
-    )
+    turn = np.arctan2(between[:, 0, 1] - between[:, 1, 0], between[:, 0, 0] + between[:, 1, 1])
     return np.rad2deg(normal), np.rad2deg(np.abs(turn))
 
 
