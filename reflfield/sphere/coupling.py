@@ -272,17 +272,59 @@ def couple(coefficients: NDArray[np.floating]) -> Coupled:
     check_band_limit("L_light", limits[1])
     check_shape("coefficients", coefficients, (None, limits[0] ** 2, limits[1] ** 2))
     n, dtype = len(coefficients), coefficients.dtype
-    places = [{pair: c for c, pair in enumerate(pairs)} for pairs in channels(limits)]
-    blocks = [np.zeros((n, 2 * j + 1, len(p)), dtype) for j, p in enumerate(places)]
+    plan = _pair_plan(limits)
+    products = coefficients.reshape(n, -1).take(plan.by_pair, axis=1)
+    turned = np.zeros_like(products)
+    for (l1, l2), part in plan.parts:
+        matrix = _coupling_of_dtype(l1, l2, str(dtype))
+        np.matmul(products[:, part], matrix, out=turned[:, part])
+    blocks = (
+        turned.take(columns, axis=1).reshape(n, 2 * j + 1, -1)
+        for j, columns in enumerate(plan.by_degree)
+    )
+    return Coupled(limits, tuple(blocks))
+
+
+@dataclass(frozen=True, eq=False)
+class _PairPlan:
+    """Orders of the coefficients: as the samples give them, by pairs (l1, l2), by degrees.
+
+    Parameters
+    ----------
+    parts : tuple of ((l1, l2), slice)
+        Where each pair stands.
+    by_pair : (k,) int64
+        Where each entry of the order by pairs, (m1, m2) within, is taken from.
+    by_degree : tuple of (k_j,) int64
+        Where each entry of degree j, (m, channel), stands in the order by pairs, where
+        (j, m) stand within.
+    """
+
+    parts: tuple[tuple[tuple[int, int], slice], ...]
+    by_pair: NDArray[np.int64]
+    by_degree: tuple[NDArray[np.int64], ...]
+
+
+@lru_cache(maxsize=32)
+def _pair_plan(limits: BandLimits) -> _PairPlan:
+    parts, orders, first = {}, [], 0
     for l1 in range(limits[0]):
         for l2 in range(limits[1]):
-            part = coefficients[:, l1 * l1 : (l1 + 1) ** 2, l2 * l2 : (l2 + 1) ** 2]
-            # einsum and broadcasting matmul would not reach the BLAS here.
-            turned = part.reshape(n, -1) @ _coupling_of_dtype(l1, l2, str(dtype))
-            for j in range(abs(l1 - l2), l1 + l2 + 1):
-                first = j * j - (l1 - l2) ** 2
-                blocks[j][:, :, places[j][l1, l2]] = turned[:, first : first + 2 * j + 1]
-    return Coupled(limits, tuple(blocks))
+            rows, columns = np.arange(l1 * l1, (l1 + 1) ** 2), np.arange(l2 * l2, (l2 + 1) ** 2)
+            orders.append((rows[:, None] * limits[1] ** 2 + columns).ravel())
+            parts[l1, l2] = slice(first, first + len(orders[-1]))
+            first = parts[l1, l2].stop
+    by_degree = [
+        np.stack(
+            [
+                parts[l1, l2].start + j * j - (l1 - l2) ** 2 + np.arange(2 * j + 1)
+                for l1, l2 in pairs
+            ],
+            axis=1,
+        ).ravel()
+        for j, pairs in enumerate(channels(limits))
+    ]
+    return _PairPlan(tuple(parts.items()), np.concatenate(orders), tuple(by_degree))
 
 
 @lru_cache(maxsize=1024)
@@ -304,18 +346,15 @@ def uncouple(coupled: Coupled) -> NDArray[np.floating]:
     True
     """
     limits, n = coupled.band_limits, len(coupled)
-    places = [{pair: c for c, pair in enumerate(pairs)} for pairs in channels(limits)]
-    out = np.zeros((n, limits[0] ** 2, limits[1] ** 2), coupled.dtype)
-    for l1 in range(limits[0]):
-        for l2 in range(limits[1]):
-            degrees = range(abs(l1 - l2), l1 + l2 + 1)
-            parts = [coupled.blocks[j][:, :, places[j][l1, l2]] for j in degrees]
-            turned = (
-                np.concatenate(parts, axis=1) @ _coupling_of_dtype(l1, l2, str(coupled.dtype)).T
-            )
-            block = turned.reshape(n, 2 * l1 + 1, 2 * l2 + 1)
-            out[:, l1 * l1 : (l1 + 1) ** 2, l2 * l2 : (l2 + 1) ** 2] = block
-    return out
+    plan = _pair_plan(limits)
+    by_degree = np.concatenate([block.reshape(n, -1) for block in coupled.blocks], axis=1)
+    turned = by_degree.take(np.argsort(np.concatenate(plan.by_degree)), axis=1)
+    products = np.zeros_like(turned)
+    for (l1, l2), part in plan.parts:
+        matrix = _coupling_of_dtype(l1, l2, str(coupled.dtype))
+        np.matmul(turned[:, part], matrix.T, out=products[:, part])
+    out = products.take(np.argsort(plan.by_pair), axis=1)
+    return out.reshape(n, limits[0] ** 2, limits[1] ** 2)
 
 
 def rotate_coupled(coupled: Coupled, blocks: NDArray[np.floating]) -> Coupled:
