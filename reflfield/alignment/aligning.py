@@ -350,8 +350,13 @@ def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit, aims: _Aims) -> _
     targets, frames = refine_targets(data, frames, cluster, n_clusters, options, task.n_threads)
     state = Materials(targets, frames, data.brightness(), cluster)
     if n_clusters > 1:
-        state = choose(data, state, options, options.steps, task.n_threads)
-        state = one_round(data, state, options, task.n_threads)
+        chosen = choose(data, state, options, options.steps, task.n_threads)
+        if not np.array_equal(chosen.cluster, state.cluster):
+            # Some texels changed their material: both targets are sharper without them.
+            targets, frames = refine_targets(
+                data, chosen.frames, chosen.cluster, n_clusters, options, task.n_threads
+            )
+            state = Materials(targets, frames, data.brightness(), chosen.cluster)
     turned = np.array([_turn_cluster(task, view, state, aims, k) for k in range(n_clusters)])
     for _ in range(options.rounds if turned.any() else 0):
         state = one_round(data, state, options, task.n_threads)

@@ -20,6 +20,7 @@ groups; the cluster whose split promises most goes first, by the sum of
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -63,6 +64,12 @@ ENOUGH_SAMPLES = 2048
 AMBIGUOUS = 4.0
 # The grid of the residuals is coarse: what it explains is never all.
 UNEXPLAINED = 0.05
+
+
+# Which texels of a cluster leave it, from their residuals and distances.
+Proposal = Callable[
+    [NDArray[np.float32], NDArray[np.float64], np.random.Generator], NDArray[np.bool_]
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -473,13 +480,36 @@ def _one_move(work: _Work, state: Materials) -> Materials | None:
 
 
 def _divide(work: _Work, state: Materials) -> tuple[Materials, NDArray[np.float64]]:
-    """Every cluster in two, and how much each division takes from the sum of log distance."""
+    """Every cluster in two, and how much each division takes from the sum of log distance.
+
+    Coarse residuals propose divisions in several ways; fitted targets tell which is best.
+    """
     size = len(state.targets.values)
     before, features = residual_features(work.data, state, work.options.floor, work.n_threads)
+    best, most = state, np.zeros(size)
+    for propose in (_most_promising, _two_means, _two_directions):
+        trial, after = _divided_by(work, state, propose, before, features)
+        gain = np.log((before + FORGIVEN) / (after + FORGIVEN))
+        gains = np.bincount(state.cluster, gain, size).astype(np.float64)
+        better = gains > most
+        most = np.where(better, gains, most)
+        best = _joined(best, trial, better, state.cluster)
+    return best, most
+
+
+def _divided_by(
+    work: _Work,
+    state: Materials,
+    propose: Proposal,
+    before: NDArray[np.float64],
+    features: NDArray[np.float32],
+) -> tuple[Materials, NDArray[np.float64]]:
+    """Every cluster in two as proposed, with fitted targets; each texel's distance then."""
+    size = len(state.targets.values)
     cluster = state.cluster.copy()
     for k in range(size):
         mine = np.flatnonzero((state.cluster == k) & (state.brightness > 0))
-        cluster[mine[_two_groups(features[mine], before[mine], work.rng)]] += size
+        cluster[mine[propose(features[mine], before[mine], work.rng)]] += size
     t = state.targets
     doubled = NodeTargets(np.concatenate([t.values, t.values]), t.view_side, t.light_side)
     targets = fit_nodes(
@@ -492,9 +522,24 @@ def _divide(work: _Work, state: Materials) -> tuple[Materials, NDArray[np.float6
         work.n_threads,
     )
     trial = Materials(targets, state.frames, state.brightness, cluster)
-    after = own_misfit(work.data, trial, work.options.floor, work.n_threads)
-    gain = np.log((before + FORGIVEN) / (after + FORGIVEN))
-    return trial, np.bincount(state.cluster, gain, size).astype(np.float64)
+    return trial, own_misfit(work.data, trial, work.options.floor, work.n_threads)
+
+
+def _joined(
+    best: Materials,
+    trial: Materials,
+    better: NDArray[np.bool_],
+    parent: NDArray[np.int32],
+) -> Materials:
+    """`best` with the divisions of `trial` for those clusters where they are better."""
+    t, size = trial.targets, len(better)
+    values = t.values.copy()
+    if len(best.targets.values) == 2 * size:
+        kept = np.tile(~better, 2)
+        values[kept] = best.targets.values[kept]
+    cluster = np.where(better[parent], trial.cluster, best.cluster)
+    targets = NodeTargets(values, t.view_side, t.light_side)
+    return Materials(targets, trial.frames, trial.brightness, cluster)
 
 
 def _losses(work: _Work, state: Materials) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -603,7 +648,7 @@ def mean_log_misfit(data: SampleSet, state: Materials, floor: float, n_threads: 
     return float(np.log(distance + FORGIVEN).sum() / max(len(distance), 1))
 
 
-def _two_groups(
+def _most_promising(
     features: NDArray[np.float32], distance: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.bool_]:
     """Group that gains most from a target of its own: who is in it."""
@@ -622,6 +667,23 @@ def _two_groups(
             if gain > most:
                 best, most = group, gain
     return best
+
+
+def _two_means(
+    features: NDArray[np.float32], distance: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Second of two groups of residuals."""
+    if len(features) < 2:
+        return np.zeros(len(distance), bool)
+    return _means(features, 2, rng) == 1
+
+
+def _two_directions(
+    features: NDArray[np.float32], distance: NDArray[np.float64], rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Second of two groups of residuals, whatever their size."""
+    size = np.linalg.norm(features, axis=1, keepdims=True)
+    return _two_means(features / np.maximum(size, 1e-15), distance, rng)
 
 
 def _means(

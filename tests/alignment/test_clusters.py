@@ -51,7 +51,14 @@ def agreement(found, label):
     return table[linear_sum_assignment(-table)].sum() / len(label)
 
 
-@pytest.mark.parametrize("materials", [SIMILAR, FAR_APART], ids=["similar", "far apart"])
+SHINY_AND_DULL = (SIMILAR[0], {"nu": 20.0, "nv": 20.0, "diffuse": 0.4, "specular": 0.05})
+
+
+@pytest.mark.parametrize(
+    "materials",
+    [SIMILAR, SHINY_AND_DULL, FAR_APART],
+    ids=["similar", "shiny and dull", "far apart"],
+)
 def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene, rng):
     frames, d, samples, label = mixture(scene, rng, materials, 60 * len(materials))
     found = align(samples, d, d, n_clusters=len(materials), refine=QUICK, n_threads=2)
