@@ -32,6 +32,9 @@ HALF_TURN_SHARE = 0.5
 # Frames share no turn where the mean frame's second singular value is below this share of the
 # first: tilts of 60 degrees with a common turn leave more than half.
 OPEN_SHARE = 0.3
+# Frames whose turns are open have a mean normal with a chance error; the mean direction of the
+# light in the target is believed instead where the two differ by more than this many of them.
+CHANCE_ERRORS = 4.0
 AXIS_STEPS = 20
 # A symmetry axis farther from the mean normal is not the normal.
 LARGEST_AXIS_TILT = np.deg2rad(40.0)
@@ -156,6 +159,26 @@ def _turn_to_light(target: Coupled) -> NDArray[np.float64]:
     return frames_from_normals(axis[None] / length, np.array([[1.0, 0.0, 0.0]]))[0].T
 
 
+def _turn_of_open_frames(
+    target: Coupled, rotations: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotation whose z is the normal of frames that share no turn.
+
+    The mean of the base normals, seen in the frames, unless that differs from the
+    target's mean light direction by more than chance: then the turns follow the tilts,
+    and the mean leans that way.
+    """
+    to_light = _turn_to_light(target)
+    base_normals = rotations[:, 2, :] @ to_light  # seen in the frames
+    total = weights.sum()
+    lean = weights @ base_normals / total
+    scatter = np.sqrt(weights**2 @ (base_normals[:, :2] ** 2)) / total
+    if not np.all(np.abs(lean[:2]) <= CHANCE_ERRORS * scatter):
+        return to_light
+    normal = lean / np.linalg.norm(lean)
+    return to_light @ frames_from_normals(normal[None], np.array([[1.0, 0.0, 0.0]]))[0].T
+
+
 def _gauge_turn(
     rotations: NDArray[np.float64], weights: NDArray[np.float64], symmetry: Symmetry
 ) -> NDArray[np.float64]:
@@ -224,8 +247,9 @@ def fix_gauge(
             known = bool(turns_known) and turns_known[k]
             turns[k] = mean_rotation(rotations[mine], weights[mine]).T
             if not known and turns_are_open(rotations[mine], weights[mine]):
-                # Turns may follow the tilts; then the mean frame leans that way.
-                turns[k] = _turn_to_light(targets[k : k + 1])
+                turns[k] = _turn_of_open_frames(
+                    targets[k : k + 1], rotations[mine], weights[mine]
+                )
             upright = turns[k] @ _normal_first(_turn_target(targets[k : k + 1], turns[k]))
             kind = symmetry_about_normal(_turn_target(targets[k : k + 1], upright), known)
             turns[k] = turns[k] if kind.kind == "none" else upright

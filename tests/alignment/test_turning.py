@@ -117,3 +117,18 @@ def test_gauge_finds_the_normal_when_turns_follow_the_tilts(scene, rng):
     lean = np.arccos(np.sum(gauged.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
     # The pile leans the mean light by a few degrees, the mean frame by thirty.
     assert np.rad2deg(lean).max() < 8.0
+
+
+def test_gauge_takes_the_mean_normal_when_turns_are_random(scene, rng):
+    """The pile leans the mean light; random turns leave the mean normal its chance error."""
+    d = scene.dome_directions()
+    target = couple(Projector(d, d, (6, 6)).project(leaning(d[None], 0.2))).units()
+    azimuth, turn = rng.uniform(0, 2 * np.pi, (2, 500))
+    tilt = rng.uniform(0, np.pi / 3, 500)
+    angles = np.stack([azimuth, tilt, turn], axis=1)
+    base_from_local = Rotation.from_euler("ZYZ", angles).as_matrix()
+    gauged = fix_gauge(target, base_from_local, np.zeros(500, np.int32), np.ones(500))
+    lean = np.arccos(np.sum(gauged.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
+    chance = np.arctan(np.linalg.norm(base_from_local[:, 2, :2].mean(axis=0)))
+    # Tilts are at most sixty degrees: the mean of the normals is longer than a half.
+    np.testing.assert_array_less(lean, 2.0 * chance)
