@@ -52,7 +52,7 @@ class CoarseGrid:
         First column of each class.
     blocks : tuple of 16 (k_class, n) float
         Real Wigner matrix elements of one rotation per orbit.
-    neighbours : (16 n, 14) int32
+    neighbours : (16 n, 10) int32
         Nearest other rotations.
     allowed : (16 n,) bool
         False where the tilt is too large.
@@ -165,7 +165,7 @@ def coarse_grid(
         allowed = rotations[:, 2, 2] >= np.cos(min(max_tilt + spacing, np.pi))
         rotations = tilted_back(rotations, max_tilt)
     tree = cKDTree(np.concatenate([q, -q]))
-    nearest = tree.query(q, k=15)[1][:, 1:] % len(q)
+    nearest = tree.query(q, k=11)[1][:, 1:] % len(q)
     return CoarseGrid(
         rotations,
         columns,

@@ -30,8 +30,8 @@ from reflfield.sphere.coupling import Coupled
 
 # Functions handled together: their series and coarse values stay within a few MB.
 BLOCK = 256
-# Of six, a thousandth of tilted anisotropic ABRDFs miss the highest; of four, a fiftieth.
-N_PEAKS = 6
+# Of eight, a thousandth of tilted anisotropic ABRDFs miss the highest; of four, a fortieth.
+N_PEAKS = 8
 # Targets whose coarse peak is among the best few are searched with all degrees.
 N_FINALISTS = 3
 Result = TypeVar("Result")
