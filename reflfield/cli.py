@@ -155,6 +155,10 @@ def run(
     until: Annotated[str, typer.Option(metavar="STAGE", help="Stop after this.")] = "report",
     workers: Workers = 0,
     max_memory: Annotated[str, typer.Option(help="Ceiling of resident memory.")] = "4GB",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a dask cluster that computes the blocks."),
+    ] = None,
     format: Format = None,
 ) -> None:
     """Make a relightable field of a capture, with a report."""
@@ -164,7 +168,7 @@ def run(
 
     started = time.perf_counter()
     options = pipeline_options(config, set_ or [])
-    resources = Resources(n_workers(workers), parse_bytes(max_memory))
+    resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler)
     held = parse_hold_out(hold_out)
     opened = open_capture(capture, format)
     with showing_progress(GOES_ON):

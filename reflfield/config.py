@@ -219,10 +219,13 @@ class Resources:
         Threads.
     max_memory : int
         Bytes of resident memory that the blocks are sized for.
+    scheduler : str, optional
+        Address of a `dask.distributed` scheduler, whose workers compute the blocks.
     """
 
     workers: int = 2
     max_memory: int = 4 << 30
+    scheduler: str | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:

@@ -3,8 +3,9 @@
 Each stage owns one folder. Its key is the SHA-256 of its name, the version of its code, its
 options and the keys of the stages it reads, so a folder whose key matches holds what
 the stage would compute again. Work goes into ``NAME.partial`` and is renamed when it
-is complete; a stage that fails removes it, and what a killed run leaves of it the next run
-removes. One run at a time may work in a folder.
+is complete. What a stage that failed or was killed has finished of its blocks
+(`reflfield.scheduling`) is taken up by the next run with the same key; all else of it is
+removed. One run at a time may work in a folder.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from typing import Any
 import psutil
 
 from reflfield.errors import InputError
+from reflfield.files import replacing
+from reflfield.scheduling import Blocks, Scheduler, Tally
 
 try:
     import fcntl
@@ -32,7 +35,12 @@ except ModuleNotFoundError:  # not on Windows: there, runs are not kept apart
     fcntl = None  # type: ignore[assignment]
 
 RECORD = "stage.json"
+KEY = "key"
 LOCK = ".lock"
+# Folders inside a stage's: results of blocks, removed when it is complete, and stores that
+# are written chunk by chunk and stay.
+BLOCKS = "blocks"
+RESTARTABLE = ("samples",)
 # Packages whose version may change what a stage computes.
 NUMERICAL_PACKAGES = ("numpy", "scipy", "numba", "open3d-cpu", "open3d", "xatlas", "zarr")
 
@@ -54,6 +62,9 @@ class StageRecord:
         What went in and what came out.
     reused : bool
         True if an earlier result was taken.
+    blocks_computed, blocks_resumed : int
+        Blocks of work that this run has done, and that it found done by one that was
+        interrupted.
     """
 
     name: str
@@ -63,6 +74,8 @@ class StageRecord:
     size_bytes: int
     counts: dict[str, Any] = field(default_factory=dict)
     reused: bool = False
+    blocks_computed: int = 0
+    blocks_resumed: int = 0
 
 
 class MemoryWatch:
@@ -117,6 +130,7 @@ class StageFolder:
         self.root = root
         self.redo = redo or set()
         self.records: list[StageRecord] = []
+        self.tally = Tally()
 
     def run(
         self,
@@ -151,26 +165,56 @@ class StageFolder:
         folder = self.root / name
         earlier = None if name in self.redo else _matching_record(folder, key)
         if earlier is not None:
+            forget_blocks(folder)
             self.records.append(earlier)
             return folder
-        with replacing_folder(folder) as partial:
-            started = time.perf_counter()
-            with MemoryWatch() as watch:
-                counts = dict(compute(partial))
-            record = StageRecord(
-                name=name,
-                key=key,
-                seconds=time.perf_counter() - started,
-                peak_bytes=watch.peak_bytes,
-                size_bytes=folder_bytes(partial),
-                counts=counts,
-            )
+        partial = folder.with_name(f"{name}.partial")
+        record = None if name in self.redo else _matching_record(partial, key)
+        if record is None:
+            prepare_partial(partial, key, fresh=name in self.redo)
             described = {"options": plain(options), "inputs": dict(inputs or {})}
-            (partial / RECORD).write_text(
-                json.dumps({**asdict(record), **described, "versions": versions()}, indent=1)
-            )
+            record = self._computed(name, key, partial, compute, described)
+        take_place(partial, folder)
         self.records.append(record)
         return folder
+
+    def _computed(
+        self,
+        name: str,
+        key: str,
+        partial: Path,
+        compute: Callable[[Path], Mapping[str, Any]],
+        described: dict[str, Any],
+    ) -> StageRecord:
+        """Compute a stage into its unfinished folder, its record last."""
+        started = time.perf_counter()
+        self.tally = Tally()
+        try:
+            with MemoryWatch() as watch:
+                counts = dict(compute(partial))
+        except BaseException:
+            if not has_blocks(partial):
+                shutil.rmtree(partial, ignore_errors=True)
+            raise
+        record = StageRecord(
+            name=name,
+            key=key,
+            seconds=time.perf_counter() - started,
+            peak_bytes=watch.peak_bytes,
+            size_bytes=folder_bytes(partial, without=BLOCKS),
+            counts=counts,
+            blocks_computed=self.tally.computed,
+            blocks_resumed=self.tally.resumed,
+        )
+        with replacing(partial / RECORD) as unfinished:
+            unfinished.write_text(
+                json.dumps({**asdict(record), **described, "versions": versions()}, indent=1)
+            )
+        return record
+
+    def blocks(self, scheduler: Scheduler, folder: Path) -> Blocks:
+        """Work by blocks of the stage that is being computed into `folder`."""
+        return Blocks(scheduler, folder / BLOCKS, self.tally)
 
     def key(self, name: str) -> str:
         """Key of a stage that has run."""
@@ -216,46 +260,69 @@ def _matching_record(folder: Path, key: str) -> StageRecord | None:
         return None
     if not isinstance(found, dict) or found.get("key") != key:
         return None
-    kept = {entry.name: found[entry.name] for entry in fields(StageRecord)}
+    kept = {f.name: found.get(f.name, f.default) for f in fields(StageRecord)}
     return StageRecord(**{**kept, "reused": True})
 
 
-def folder_bytes(folder: Path) -> int:
-    """Size of all files below a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+def folder_bytes(folder: Path, without: str) -> int:
+    """Size of all files below a folder, one of the folders in it left out."""
+    kept = [entry for entry in folder.iterdir() if entry.name != without]
+    files = [path for entry in kept for path in (entry, *entry.rglob("*")) if path.is_file()]
+    return sum(path.stat().st_size for path in files)
 
 
-@contextmanager
-def replacing_folder(folder: Path) -> Iterator[Path]:
-    """Yield a new folder that takes the place of `folder` if the block succeeds, else vanishes.
+def prepare_partial(partial: Path, key: str, *, fresh: bool) -> None:
+    """Make the folder that a stage is computed in, with the blocks of a killed run of it.
 
-    The earlier folder loses its record before its files: killed in between, it is
-    computed again, and never taken for complete.
+    Only what is restartable by block is kept, and only of the same stage with the same key.
     """
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
     try:
-        yield partial
-        (folder / RECORD).unlink(missing_ok=True)
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.rename(folder)
-    finally:
+        same = (partial / KEY).read_text() == key
+    except OSError:
+        same = False
+    if fresh or not same:
         shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        with replacing(partial / KEY) as unfinished:
+            unfinished.write_text(key)
+    for entry in partial.iterdir():
+        if entry.name not in (KEY, BLOCKS, *RESTARTABLE):
+            remove(entry)
+    for name in RESTARTABLE:
+        # What a kill left of a chunk that was being written.
+        for unfinished in (partial / name).rglob("*.partial"):
+            unfinished.unlink()
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name that becomes `path` if the block succeeds, else vanishes.
+def has_blocks(partial: Path) -> bool:
+    """Whether anything in a stage's unfinished folder is worth keeping."""
+    return (partial / BLOCKS).is_dir() or (partial / RECORD).is_file()
 
-    The name is always the same, so that what a killed run left of it is written over.
+
+def take_place(partial: Path, folder: Path) -> None:
+    """Put a complete stage in the place of an earlier one.
+
+    The earlier folder loses its record before its files: killed in between, it is not taken
+    for complete, and the finished one beside it takes its place in the next run.
     """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    (folder / RECORD).unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+    forget_blocks(folder)
+
+
+def forget_blocks(folder: Path) -> None:
+    """Remove what a complete stage was put together from."""
+    shutil.rmtree(folder / BLOCKS, ignore_errors=True)
+    (folder / KEY).unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 @contextmanager

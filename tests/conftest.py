@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import distributed
 import numpy as np
 import pytest
 
@@ -38,6 +39,15 @@ def rounding():
         return float(safety * np.finfo(dtype).eps * operations * condition * scale)
 
     return tolerance
+
+
+@pytest.fixture(scope="session")
+def cluster():
+    """Address of a dask cluster of two worker processes."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as local:
+        yield local.scheduler_address
 
 
 @pytest.fixture(scope="session")

@@ -13,8 +13,10 @@ ROOT = Path(__file__).parents[1]
 ROOMS = (
     "errors",
     "checks",
+    "files",
     "progress",
     "config",
+    "scheduling",
     "sphere",
     "factorization",
     "capture",

@@ -33,7 +33,6 @@ from reflfield.alignment.searching import (
     SearchOptions,
     SearchResult,
     map_blocks,
-    one_core_blas,
     search,
 )
 from reflfield.alignment.splines import NodeTargets
@@ -41,6 +40,7 @@ from reflfield.alignment.turning import best_turns, find_turns, turn_margin
 from reflfield.checks import unit_directions
 from reflfield.errors import InputError, ShapeError
 from reflfield.progress import track
+from reflfield.scheduling import one_core_blas
 from reflfield.sphere.coupling import Coupled, couple, join_coupled
 from reflfield.sphere.harmonics import check_band_limit
 from reflfield.sphere.projection import Projector

@@ -7,7 +7,7 @@ are few on sparse rigs, so the turn away from the harmonic frame has a Gaussian 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -89,37 +89,68 @@ def refine_scattered(
     n = source.shape[0]
     check_shape("local_from_base", local_from_base, (n, 3, 3))
     check_shape("cluster", cluster, (n,))
-    frames = np.ascontiguousarray(local_from_base, np.float64).copy()
-    targets, used = _targets(source, frames, cluster, options, seed, n_threads)
-    starts = frames.copy()
+    frames = np.ascontiguousarray(local_from_base, np.float64)
+    sharp = sharp_targets(source, frames, cluster, options, seed=seed, n_threads=n_threads)
     step = _texels_in(BLOCK_BYTES, source)
     blocks = [np.arange(first, min(first + step, n)) for first in range(0, n, step)]
-    for rows in track(blocks, len(blocks), "frames on the samples"):
-        data = _of_unit_size(source.read(rows))
-        part = frames[rows]
-        improve_frames(
-            data,
-            part,
-            data.brightness(),
-            cluster[rows],
-            targets,
-            used,
-            used.last_steps,
-            n_threads,
-        )
-        frames[rows] = part
-    return _in_gauge_of(starts, frames, cluster)
+    parts = [
+        improved_block(source.read(rows), frames[rows], cluster[rows], sharp, n_threads)
+        for rows in track(blocks, len(blocks), "frames on the samples")
+    ]
+    return in_gauge_of(frames, np.concatenate(parts), cluster)
 
 
-def _targets(
+@dataclass(frozen=True, eq=False)
+class SharpTargets:
+    """Targets that frames are refined against, and how.
+
+    Parameters
+    ----------
+    targets : NodeTargets
+    options : RefinementOptions
+        ``side`` is that of the targets.
+    """
+
+    targets: NodeTargets
+    options: RefinementOptions
+
+
+def improved_block(
+    data: SampleSet,
+    frames: Array,
+    cluster: NDArray[np.int32],
+    sharp: SharpTargets,
+    n_threads: int = 1,
+) -> Array:
+    """Frames of some texels, improved on their samples; parameters as `refine_scattered`."""
+    improved = frames.copy()
+    data = _of_unit_size(data)
+    improve_frames(
+        data,
+        improved,
+        data.brightness(),
+        cluster,
+        sharp.targets,
+        sharp.options,
+        sharp.options.last_steps,
+        n_threads,
+    )
+    return improved
+
+
+def sharp_targets(
     source: ScatteredSource,
     frames: Array,
     cluster: NDArray[np.int32],
     options: RefinementOptions,
-    seed: int,
-    n_threads: int,
-) -> tuple[NodeTargets, RefinementOptions]:
-    """Sharp targets fitted to some texels, with the side that their samples allow."""
+    *,
+    seed: int = 0,
+    n_threads: int = 1,
+) -> SharpTargets:
+    """Sharp targets fitted to some texels, with the side that their samples allow.
+
+    Parameters as `refine_scattered`.
+    """
     n_clusters = int(cluster.max(initial=0)) + 1
     n = source.shape[0]
     most = min(options.texels_per_cluster * n_clusters, _texels_in(TARGET_BYTES, source), n)
@@ -127,7 +158,7 @@ def _targets(
     data = _of_unit_size(source.read(some))
     used = replace(options, side=min(options.side, supported_side(data, n_clusters)))
     targets, _ = refine_targets(data, frames[some], cluster[some], n_clusters, used, n_threads)
-    return targets, used
+    return SharpTargets(targets, used)
 
 
 def _texels_in(size: int, source: ScatteredSource) -> int:
@@ -159,7 +190,7 @@ def _of_unit_size(data: SampleSet) -> SampleSet:
     return replace(data, samples=samples.astype(np.float32))
 
 
-def _in_gauge_of(starts: Array, frames: Array, cluster: NDArray[np.int32]) -> Array:
+def in_gauge_of(starts: Array, frames: Array, cluster: NDArray[np.int32]) -> Array:
     """Undo the mean turn of each cluster from its frames before."""
     result = frames.copy()
     for k in np.unique(cluster):

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import ThreadpoolController
 
 from reflfield.alignment.climbing import (
     APPROACH_DEGREES,
@@ -26,6 +23,7 @@ from reflfield.alignment.coarse import coarse_peaks
 from reflfield.alignment.correlation import spectrum
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.scheduling import one_core_blas
 from reflfield.sphere.coupling import Coupled
 
 # Functions handled together: their series and coarse values stay within a few MB.
@@ -160,17 +158,6 @@ def map_blocks(
             return [work(block) for block in blocks]
         with ThreadPoolExecutor(n_threads) as pool:
             return list(pool.map(work, blocks))
-
-
-def one_core_blas() -> AbstractContextManager[object]:
-    """Keep the BLAS from threads of its own: the blocks have theirs, and two layers fight."""
-    return _thread_pools().limit(limits=1, user_api="blas")
-
-
-@lru_cache(maxsize=1)
-def _thread_pools() -> ThreadpoolController:
-    """Libraries with threads in this process; finding them takes milliseconds."""
-    return ThreadpoolController()
 
 
 def _check_search(

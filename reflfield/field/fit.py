@@ -554,20 +554,41 @@ def fit_samples(
     InputError
         If no texel is observed.
     """
+    model = fit_basis(
+        read, start, observed, bytes_per_texel, options, workers=workers, seed=seed
+    )
+    coefficients = model.coefficients.copy()
+    step = max(64, options.max_bytes // bytes_per_texel // 2)
+    blocks = [observed[i : i + step] for i in range(0, len(observed), step)]
+    with ThreadPoolExecutor(workers) as pool:
+        for block in track(blocks, len(blocks), "coefficients of all texels"):
+            found, _ = solve_coefficients(read(block), model.cluster[block], model, pool)
+            coefficients[block] = found
+    return replace(model, coefficients=coefficients)
+
+
+def fit_basis(
+    read: Reader,
+    start: ClusteredModel,
+    observed: NDArray[np.intp],
+    bytes_per_texel: int,
+    options: SampleFitOptions,
+    *,
+    workers: int = 1,
+    seed: int = 0,
+) -> ClusteredModel:
+    """Fit mean and basis to the samples of as many texels as fit in memory.
+
+    Parameters, returns and errors as `fit_samples`; coefficients of other texels are those
+    that they were given.
+    """
     if not len(observed):
         raise InputError("observed: expected texels with samples, received none")
     n_chosen = int(np.clip(options.max_bytes // bytes_per_texel, 256, len(observed)))
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.choice(observed, min(n_chosen, len(observed)), replace=False))
     with ThreadPoolExecutor(workers) as pool:
-        model = _alternate(read(chosen), start, chosen, options, pool)
-        coefficients = model.coefficients.copy()
-        step = max(64, n_chosen // 2)
-        blocks = [observed[i : i + step] for i in range(0, len(observed), step)]
-        for block in track(blocks, len(blocks), "coefficients of all texels"):
-            found, _ = solve_coefficients(read(block), model.cluster[block], model, pool)
-            coefficients[block] = found
-    return replace(model, coefficients=coefficients)
+        return _alternate(read(chosen), start, chosen, options, pool)
 
 
 def _alternate(

@@ -263,31 +263,37 @@ def improved_frames(
     The prior weighs against the samples by the texel's own mean squared residual. Samples
     within a degree of the frame's horizon, or below it, have no say.
     """
-    n_nodes = (reader.sides[0] ** 2, reader.sides[1] ** 2)
-    check_shape("model.table", model.table, (None, *n_nodes, None))
     frames = reader.local_from_world.copy()
-
-    def improve(rows: NDArray[np.intp]) -> None:
-        found = reader.measured(rows)
-        turned = frames[rows].astype(np.float64)
-        _improve(
-            root(found.samples.astype(np.float32), reader.options.domain),
-            (found.views.astype(np.float64), found.lights.astype(np.float64)),
-            (found.view_seen, found.light_seen),
-            found.pairs,
-            model.table,
-            model.cluster[rows],
-            model.coefficients[rows],
-            reader.sides,
-            POWERS[reader.options.domain],
-            spread,
-            turned,
-        )
-        frames[rows] = turned
-
     size = TEXELS_AT_ONCE
     blocks = [texels[first : first + size] for first in range(0, len(texels), size)]
     with ThreadPoolExecutor(workers) as pool:
-        for _ in track(pool.map(improve, blocks), len(blocks), "frames against the model"):
-            pass
+        found = pool.map(lambda rows: improved_block(reader, model, rows, spread), blocks)
+        for rows, part in track(
+            zip(blocks, found, strict=True), len(blocks), "frames against the model"
+        ):
+            frames[rows] = part
     return frames
+
+
+def improved_block(
+    reader: TexelReader, model: ClusteredModel, texels: NDArray[np.intp], spread: float
+) -> Floats:
+    """Frames (k, 3, 3) of some texels; see `improved_frames`."""
+    n_nodes = (reader.sides[0] ** 2, reader.sides[1] ** 2)
+    check_shape("model.table", model.table, (None, *n_nodes, None))
+    found = reader.measured(texels)
+    frames = reader.local_from_world[texels].astype(np.float64)
+    _improve(
+        root(found.samples.astype(np.float32), reader.options.domain),
+        (found.views.astype(np.float64), found.lights.astype(np.float64)),
+        (found.view_seen, found.light_seen),
+        found.pairs,
+        model.table,
+        model.cluster[texels],
+        model.coefficients[texels],
+        reader.sides,
+        POWERS[reader.options.domain],
+        spread,
+        frames,
+    )
+    return frames.astype(np.float32)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -13,14 +14,19 @@ from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
-from reflfield.observations.store import VIEWS_PER_CHUNK, create_samples
-from reflfield.progress import report
+from reflfield.observations.store import (
+    Location,
+    chunk_shape,
+    create_samples,
+    is_written,
+)
+from reflfield.scheduling import Blocks
 
 Floats = NDArray[np.float32]
 # Largest half float; a mirror-like peak beyond it is held there.
 HALF_MAX = 65504.0
-# Bytes for the samples, and for the photographs, that are held at a time.
-BUDGET = 512 << 20
+# Bytes for the photographs that are held at a time.
+BUDGET = 256 << 20
 # Lights sampled together: the pixel positions are worked out once for all of them.
 LIGHTS_AT_ONCE = 32
 
@@ -91,14 +97,9 @@ def facing_irradiance(lights: tuple[Light, ...], positions: NDArray[np.floating]
     return np.stack([light.irradiance(points) for light in lights], axis=1).astype(np.float32)
 
 
-def project_photographs(
-    capture: Capture,
-    positions: NDArray[np.floating],
-    visible: NDArray[np.bool_],
-    folder: Path,
-    budget: int = BUDGET,
-) -> None:
-    """Write the samples of all texels: radiance divided by the light's irradiance.
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Photographs and the texels that they are projected onto.
 
     Parameters
     ----------
@@ -107,12 +108,46 @@ def project_photographs(
     positions : (n_texels, 3) float
         Points of the surface, metres.
     visible : (n_texels, n_views) bool
-        True where the camera sees the texel; other samples stay zero.
-    folder : Path
-        Store to create.
+        True where the camera sees the texel; other samples are zero.
+    location : Path or str
+        Store to write.
     budget : int
-        Bytes for the samples of the views, and for the photographs, held at a time. The
-        samples do not depend on it.
+        Bytes for the photographs held at a time. The samples do not depend on it.
+    """
+
+    capture: Capture
+    positions: NDArray[np.floating]
+    visible: NDArray[np.bool_]
+    location: Location
+    budget: int = BUDGET
+
+    def __post_init__(self) -> None:
+        check_shape("positions", self.positions, (None, 3))
+        check_shape("visible", self.visible, (len(self.positions), self.capture.n_views))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Texels, views and lights."""
+        return len(self.positions), self.capture.n_views, self.capture.n_lights
+
+    def views_of_chunks(self) -> list[range]:
+        """Views whose samples are written together."""
+        step = chunk_shape(*self.shape)[1]
+        n_views = self.capture.n_views
+        return [range(i, min(i + step, n_views)) for i in range(0, n_views, step)]
+
+
+def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1) -> None:
+    """Write the samples of all texels: radiance divided by the light's irradiance.
+
+    Parameters
+    ----------
+    projection : Projection
+    blocks : Blocks
+        Who does it, a few views at a time; what an interrupted run has written is kept.
+    at_once : int
+        Threads for whose blocks there is memory: a block takes the samples of its views and
+        `Projection.budget`.
 
     Raises
     ------
@@ -123,30 +158,42 @@ def project_photographs(
 
     Notes
     -----
-    Every photograph is read once. A chunk's worth of views is held at a time,
-    ``VIEWS_PER_CHUNK * n_texels * n_lights * 6`` bytes, or fewer by `budget`; one at least.
+    Every photograph is read once.
     """
-    check_shape("positions", positions, (None, 3))
-    check_shape("visible", visible, (len(positions), capture.n_views))
-    group = _views_at_once(len(positions), capture.n_lights, budget)
-    store = create_samples(folder, len(positions), capture.n_views, capture.n_lights, group)
-    points = np.asarray(positions, np.float64)
-    report("projecting photographs", 0, capture.n_views)
-    for first in range(0, capture.n_views, group):
-        views = range(first, min(first + group, capture.n_views))
-        block = np.zeros((len(points), len(views), capture.n_lights, 3), np.float16)
-        for i, view in enumerate(views):
-            seen = np.flatnonzero(visible[:, view])
-            for lights, values in _view_samples(capture, view, points[seen], budget):
-                block[seen[:, None], i, lights] = values
-            report("projecting photographs", view + 1, capture.n_views)
-        store[:, views.start : views.stop] = block
+    create_samples(projection.location, *projection.shape)
+    blocks.map(
+        "projecting photographs",
+        project_views,
+        projection,
+        projection.views_of_chunks(),
+        intact=has_views,
+        at_once=at_once,
+    )
 
 
-def _views_at_once(n_texels: int, n_lights: int, budget: int = BUDGET) -> int:
-    """Views whose samples are held together: a chunk's, fewer if they pass the budget."""
-    fits = budget // max(n_texels * n_lights * 6, 1)
-    return int(min(max(fits, 1), VIEWS_PER_CHUNK))
+def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any]]:
+    """Write the samples of a few views; gives the number of photographs read."""
+    points = np.asarray(projection.positions, np.float64)
+    n_lights = projection.capture.n_lights
+    block = np.zeros((len(points), len(views), n_lights, 3), np.float16)
+    n_read = 0
+    for i, view in enumerate(views):
+        seen = np.flatnonzero(projection.visible[:, view])
+        for lights, values in _view_samples(
+            projection.capture, view, points[seen], projection.budget
+        ):
+            block[seen[:, None], i, lights] = values
+            n_read += len(lights)
+    # Created before: this opens it.
+    store = create_samples(projection.location, *projection.shape)
+    store[:, views.start : views.stop] = block
+    return {"photographs": np.array(n_read)}
+
+
+def has_views(projection: Projection, views: range) -> bool:
+    """Whether the store holds the samples of some views, whole."""
+    store = create_samples(projection.location, *projection.shape)
+    return is_written(store, (slice(None), slice(views.start, views.stop)))
 
 
 def _view_samples(

@@ -103,6 +103,12 @@ class TexelReader:
         n_views, n_lights = self.capture.n_views, self.capture.n_lights
         return 2 * 12 * n_views * n_lights + 80 * (n_views + n_lights)
 
+    def blocks_of(self, texels: Indices) -> list[Indices]:
+        """Texels, ascending, cut where the chunks of the store are."""
+        edges = np.arange(0, self.n_texels, self.store.texels_per_chunk)[1:]
+        parts = np.split(texels, np.searchsorted(texels, edges))
+        return [part for part in parts if len(part)]
+
     def rotated(self, local_from_world: Floats) -> TexelReader:
         """Return a reader of the same samples in other frames."""
         return replace(self, local_from_world=local_from_world)

@@ -1,30 +1,56 @@
 """Apparent BRDF samples of all texels on disk, written by views, read by texels.
 
-A store is a folder with one zarr array ``samples`` of shape
-(n_texels, n_views, n_lights, 3), half floats, in chunks of some texels and some
-views. Which samples count follows from three small arrays beside it: the views
-and lights that each texel sees, and the pairs that were photographed.
+A store is one zarr array of shape (n_texels, n_views, n_lights, 3), half floats, in chunks
+of some texels and some views, in a folder or in object storage. Chunks are written whole or
+not at all and carry a CRC-32C. Which samples count follows from three small arrays beside
+it: the views and lights that each texel sees, and the pairs that were photographed.
 """
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.storage import FsspecStore
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
 
 Bools = NDArray[np.bool_]
+# A folder, or the URL of one for fsspec, such as ``s3://bucket/name``.
+Location: TypeAlias = Path | str
 
-# A chunk of 1024 texels x 8 views x 32 lights x RGB is 1.5 MB as halves: small enough to
-# be read by texels, large enough to be written by views.
-TEXELS_PER_CHUNK = 1024
+# Texels of a chunk: many enough that a chunk is about a megabyte, few enough to be
+# resampled together.
+LEAST_TEXELS_PER_CHUNK, MOST_TEXELS_PER_CHUNK = 256, 4096
+CHUNK_BYTES = 1 << 20
+# Views of a chunk: those whose samples a writer holds together.
 VIEWS_PER_CHUNK = 8
+WRITER_BYTES = 128 << 20
+SAMPLE_BYTES = 6
+
+
+def chunk_shape(n_texels: int, n_views: int, n_lights: int) -> tuple[int, int]:
+    """Texels and views of a chunk; they follow from the shape alone, not from the memory.
+
+    Examples
+    --------
+    The paper's dome, and a few photographs of a fine surface:
+
+    >>> chunk_shape(40_000, 151, 151), chunk_shape(200_000, 16, 1)
+    ((256, 3), (4096, 8))
+    """
+    of_view = n_texels * n_lights * SAMPLE_BYTES
+    views = int(np.clip(WRITER_BYTES // of_view, 1, min(VIEWS_PER_CHUNK, n_views)))
+    fits = CHUNK_BYTES / (views * n_lights * SAMPLE_BYTES)
+    power_of_two = 2 ** int(np.log2(max(fits, 1.0)))
+    texels = int(np.clip(power_of_two, LEAST_TEXELS_PER_CHUNK, MOST_TEXELS_PER_CHUNK))
+    return min(texels, n_texels), views
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,60 +99,102 @@ class ObservationStore:
 
     Parameters
     ----------
-    folder : Path
-        Folder that holds the zarr array.
+    location : Path or str
+        Of the zarr array.
     observed : Observed
         What counts; kept in memory, one byte per texel and direction.
     """
 
-    folder: Path
+    location: Location
     observed: Observed
 
     @property
     def samples(self) -> zarr.Array:
         """(n_texels, n_views, n_lights, 3) float16 on disk."""
-        return zarr.open_array(self.folder / "samples", mode="r")
+        return zarr.open_array(opened(self.location), mode="r")
 
     @property
     def n_texels(self) -> int:
         """Number of texels."""
         return len(self.observed.views)
 
+    @property
+    def texels_per_chunk(self) -> int:
+        """Texels that are best read together, from multiples of their number."""
+        return int(self.samples.chunks[0])
+
     def read(self, texels: slice | NDArray[np.integer]) -> NDArray[np.float16]:
-        """Samples (k, n_views, n_lights, 3) of some texels; those never written are zero.
+        """Samples (k, n_views, n_lights, 3) of some texels.
 
         Parameters
         ----------
         texels : slice or (k,) int
             In any order, with repeats; ascending ones read each chunk once.
+
+        Raises
+        ------
+        InputError
+            If a chunk is missing or damaged.
         """
-        array = self.samples
-        if isinstance(texels, slice):
-            return np.asarray(array[texels])
-        return np.asarray(array.oindex[np.asarray(texels)])
+        return checked_read(self.location, self.samples, texels)
 
     def raw_bytes(self) -> int:
         """Size of all samples as half floats."""
         return int(np.prod(self.samples.shape)) * 2
 
 
+def checked_read(
+    location: Location, array: zarr.Array, rows: slice | NDArray[np.integer]
+) -> NDArray[np.float16]:
+    """Rows of an array of halves, (k, ...).
+
+    A chunk that is missing reads as NaN, which is looked for in its first entries.
+
+    Raises
+    ------
+    InputError
+        If a chunk is missing or damaged.
+    """
+    try:
+        # One chunk after the other for indices, whole chunks for slices.
+        found = array[rows] if isinstance(rows, slice) else array.oindex[np.asarray(rows)]
+    except ValueError as error:
+        raise InputError(
+            f"{location}: expected chunks that agree with their checksums, found one that "
+            f"does not ({error}); compute the stage again with --from"
+        ) from error
+    found = np.asarray(found)
+    first = (slice(None), *(slice(None, None, step) for step in array.chunks[1:]))
+    if np.isnan(found[first]).any():
+        raise InputError(
+            f"{location}: expected all chunks, found some missing; compute the stage again "
+            "with --from"
+        )
+    return found
+
+
+def opened(location: Location) -> str | FsspecStore:
+    """What zarr opens for a location; local files are always written by rename."""
+    text = str(location)
+    if "://" in text and not text.startswith("file://"):
+        return FsspecStore.from_url(text)
+    return text.removeprefix("file://")
+
+
 def create_samples(
-    folder: Path, n_texels: int, n_views: int, n_lights: int, n_views_per_chunk: int
+    location: Location, n_texels: int, n_views: int, n_lights: int
 ) -> zarr.Array:
-    """Create an empty ``samples`` array; whatever the folder held is removed.
+    """Create an array of samples, or open the one that an interrupted run began.
 
     Parameters
     ----------
-    folder : Path
-        Folder to hold the array.
+    location : Path or str
     n_texels, n_views, n_lights : int
-    n_views_per_chunk : int
-        Views that will be written together.
 
     Returns
     -------
     zarr.Array
-        (n_texels, n_views, n_lights, 3) float16, all zero.
+        (n_texels, n_views, n_lights, 3) float16. Chunks never written count as missing.
 
     Raises
     ------
@@ -136,14 +204,33 @@ def create_samples(
     for name, count in (("texels", n_texels), ("views", n_views), ("lights", n_lights)):
         if count < 1:
             raise InputError(f"{name}: expected at least one, received {count}")
-    if folder.exists():
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
-    chunk = (min(TEXELS_PER_CHUNK, n_texels), min(n_views_per_chunk, n_views), n_lights, 3)
+    shape = (n_texels, n_views, n_lights, 3)
+    chunks = (*chunk_shape(n_texels, n_views, n_lights), n_lights, 3)
+    store = opened(location)
+    try:
+        found = zarr.open_array(store, mode="r+")
+        if (found.shape, found.chunks, str(found.dtype)) == (shape, chunks, "float16"):
+            return found
+    except (FileNotFoundError, ValueError, KeyError):
+        pass
     return zarr.create_array(
-        folder / "samples",
-        shape=(n_texels, n_views, n_lights, 3),
-        chunks=chunk,
+        store,
+        shape=shape,
+        chunks=chunks,
         dtype="float16",
-        fill_value=0,
-    )
+        fill_value=np.nan,
+        compressors=[BloscCodec(cname="lz4", clevel=1, shuffle="shuffle", typesize=2),
+                     Crc32cCodec()],
+        config={"write_empty_chunks": True},
+        overwrite=True,
+    )  # fmt: skip
+
+
+def is_written(array: zarr.Array, part: tuple[slice, ...]) -> bool:
+    """Whether the chunks of a part are all there and agree with their checksums."""
+    try:
+        found = np.asarray(array[part])
+    except ValueError:
+        return False
+    first = tuple(slice(None, None, step) for step in array.chunks)
+    return not np.isnan(found[first]).any()

@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.factorization import Completion
+from reflfield.factorization.inference import infer_coefficients
+from reflfield.factorization.sources import blocks_of
 from reflfield.observations.reading import NodeColumns, TexelReader
+from reflfield.scheduling import Blocks
 
 Floats = NDArray[np.float32]
 Halves = NDArray[np.float16]
@@ -18,6 +22,8 @@ Indices = NDArray[np.intp]
 # the result, what is handed on of it.
 COPIES_WHILE_RESAMPLING = 6
 MOST_TEXELS_AT_ONCE = 256
+# Columns of one block of a completion.
+COLUMNS_AT_ONCE = 256
 
 
 def texels_at_once(reader: TexelReader, block_bytes: int) -> int:
@@ -47,11 +53,6 @@ class BlockedColumns:
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self._nodes.shape
-
-    @property
-    def run_length(self) -> int:
-        """Columns that are best read together."""
-        return self._nodes.run_length
 
     @property
     def _nodes(self) -> NodeColumns:
@@ -101,12 +102,44 @@ class HalfColumns:
         return np.asarray(stored[columns], np.float32).T
 
 
-def half_columns(source: BlockedColumns, memory: int, folder: Path) -> HalfColumns:
-    """Read all columns once.
+@dataclass(frozen=True, eq=False)
+class Resampling:
+    """What all blocks of texels that are resampled share.
 
     Parameters
     ----------
-    source : BlockedColumns
+    reader : TexelReader
+    block_bytes : int
+        Working memory; values do not depend on it.
+    """
+
+    reader: TexelReader
+    block_bytes: int
+
+    def columns(self, texels: Indices) -> tuple[Floats, Floats]:
+        """Values (n_rows, k) and weights (n_rows // 3, k) of some texels."""
+        source = BlockedColumns(self.reader, texels, self.block_bytes)
+        return source.read(np.arange(len(texels)))
+
+
+def resampled_halves(context: Resampling, texels: Indices) -> dict[str, Halves]:
+    """Resampled texels as rows of halves: a block of `half_columns`."""
+    values, weights = context.columns(texels)
+    return {"values": values.T.astype(np.float16), "weights": weights.T.astype(np.float16)}
+
+
+def half_columns(
+    blocks: Blocks, context: Resampling, texels: Indices, memory: int, folder: Path
+) -> HalfColumns:
+    """Resample texels once, for several passes.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        Who resamples them; what an interrupted run has done is kept.
+    context : Resampling
+    texels : (n,) int
+        Ascending.
     memory : int
         Bytes up to which they are held in memory.
     folder : Path
@@ -117,17 +150,43 @@ def half_columns(source: BlockedColumns, memory: int, folder: Path) -> HalfColum
     HalfColumns
         The same values in both cases.
     """
-    rows, n = source.shape
-    paths = (folder / "values", folder / "weights")
+    n, rows = len(texels), context.reader.n_pairs * 3
+    parts = [texels[i : i + COLUMNS_AT_ONCE] for i in range(0, n, COLUMNS_AT_ONCE)]
+    found = blocks.map("resampling for the basis", resampled_halves, context, parts)
     fits = n * (rows + rows // 3) * 2 <= memory
     kept = [np.zeros((n if fits else 0, width), np.float16) for width in (rows, rows // 3)]
-    for first in range(0, n, source.run_length):
-        part = np.arange(first, min(first + source.run_length, n))
-        for i, block in enumerate(source.read(part)):
+    paths = (folder / "values", folder / "weights")
+    for i, part in enumerate(found):
+        for array, path, name in zip(kept, paths, ("values", "weights"), strict=True):
+            block = part[name]
             if fits:
-                kept[i][part] = block.T
+                array[i * COLUMNS_AT_ONCE : i * COLUMNS_AT_ONCE + len(block)] = block
             else:
-                with paths[i].open("ab") as file:
-                    np.ascontiguousarray(block.T, np.float16).tofile(file)
+                with path.open("ab") as file:
+                    block.tofile(file)
     values, weights = kept if fits else paths
-    return HalfColumns(values, weights, source.shape)
+    return HalfColumns(values, weights, (rows, n))
+
+
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """A completion, and the texels whose coefficients in it are asked for.
+
+    Parameters
+    ----------
+    completion : Completion
+    texels : Resampling
+    """
+
+    completion: Completion
+    texels: Resampling
+
+
+def inferred(context: Inference, texels: Indices) -> dict[str, Floats]:
+    """Coefficients of some texels that did not shape a completion."""
+    parts = []
+    for some in blocks_of(texels, COLUMNS_AT_ONCE):
+        values, weights = context.texels.columns(some)
+        found, _ = infer_coefficients(context.completion, values, weights=weights, n_channels=3)
+        parts.append(found)
+    return {"coefficients": np.concatenate(parts)}

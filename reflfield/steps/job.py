@@ -18,7 +18,8 @@ from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import TexelReader, grid_sides
-from reflfield.observations.store import ObservationStore, Observed
+from reflfield.observations.store import Location, ObservationStore, Observed
+from reflfield.scheduling import Blocks, Scheduler
 from reflfield.stages import StageFolder
 from reflfield.steps.options import PipelineOptions
 
@@ -54,6 +55,20 @@ class Job:
     def stages(self) -> StageFolder:
         """Folders of the stages."""
         return StageFolder(self.out / "stages", set(self.redo))
+
+    @cached_property
+    def scheduler(self) -> Scheduler:
+        """Who computes blocks."""
+        return Scheduler(self.resources.workers, self.resources.scheduler)
+
+    def blocks(self, folder: Path) -> Blocks:
+        """Work by blocks of the stage that is being computed into `folder`."""
+        return self.stages.blocks(self.scheduler, folder)
+
+    @property
+    def samples_location(self) -> Location:
+        """Where the samples of all texels are: in their stage's folder, or in a store."""
+        return self.stages.root / "observations" / "samples"
 
     @cached_property
     def held_views(self) -> NDArray[np.intp]:
@@ -154,7 +169,7 @@ class Job:
     def base_reader(self) -> TexelReader:
         """Samples in the base frames."""
         return TexelReader(
-            store=ObservationStore(self.stages.root / "observations", self.observed),
+            store=ObservationStore(self.samples_location, self.observed),
             capture=self.training,
             positions=self.texels.position,
             local_from_world=self.texels.local_from_world,

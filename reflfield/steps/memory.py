@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from reflfield.config import gigabytes
 from reflfield.errors import InputError
+from reflfield.observations.store import SAMPLE_BYTES, chunk_shape
 from reflfield.steps.job import Job
 
 # Libraries, compiled kernels and the code itself, measured.
@@ -12,6 +13,8 @@ BASE_BYTES = 512 << 20
 PHOTOGRAPH_COPIES = 3
 # Position, frames, area, quaternions: what is kept of a texel besides the arrays below.
 TEXEL_BYTES = 256
+# A writer's samples, while they are cut into chunks and encoded.
+WRITER_COPIES = 2
 # Largest share of a texture that charts cover.
 LARGEST_USE = 0.8
 
@@ -55,3 +58,12 @@ def check_memory(job: Job) -> None:
             f"{most_texels(job)} texels, received {gigabytes(given)}; raise it, or lower "
             "texture.largest"
         )
+
+
+def writers_at_once(job: Job) -> int:
+    """Threads that may each hold the samples of a few views, and photographs, at a time."""
+    n_texels, n_views, n_lights = (len(job.texels), job.training.n_views, job.training.n_lights)
+    views = chunk_shape(n_texels, n_views, n_lights)[1]
+    each = views * n_texels * n_lights * SAMPLE_BYTES + job.resources.block_bytes
+    free = job.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES
+    return int(max(1, free // (WRITER_COPIES * each)))

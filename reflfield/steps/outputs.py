@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,15 @@ from reflfield.config import write_toml
 from reflfield.export.gltf import write_glb
 from reflfield.field.file import describe, open_field
 from reflfield.field.model import ReflectanceField
+from reflfield.files import replacing
 from reflfield.geometry.visibility import RayScene
-from reflfield.stages import plain, replacing, versions
+from reflfield.observations.store import ObservationStore
+from reflfield.stages import plain, versions
 from reflfield.steps import evaluation
 from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
 from reflfield.steps.standalone import metrics_text
 
-# Texels whose raw samples are averaged together for the mean texture.
-TEXELS_AT_ONCE = 1024
 # Sets of frames that are compared: title and sentence.
 FRAME_TITLES = {
     "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
@@ -85,7 +85,7 @@ def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
     """Pictures in texture space, the mesh with its mean texture, metrics and the page."""
     field = open_field(job.stages.root / "compression" / "field.rfld")
     _write_maps(job, field, folder)
-    average = average_samples(job)
+    average = average_samples(job, folder)
     _write_mesh(job, average, folder)
     heldout, truth = (evaluation.stored_comparison(job, name) for name in ("heldout", "truth"))
     (folder / "metrics.json").write_text(metrics_text(heldout or truth))
@@ -102,18 +102,44 @@ def _write_maps(job: Job, field: ReflectanceField, folder: Path) -> None:
         write_exr(folder / f"{name}.exr", image.astype(np.float32))
 
 
-def average_samples(job: Job) -> NDArray[np.float32]:
+def average_samples(job: Job, folder: Path) -> NDArray[np.float32]:
     """Mean observed sample of every texel, (n_texels, 3); NaN where there is none."""
     store = job.base_reader.store
-    observed = store.observed
-    averages = np.full((store.n_texels, 3), np.nan, np.float32)
-    each = SAMPLE_BYTES * observed.pairs.size
-    step = int(np.clip(job.resources.block_bytes // each, 1, TEXELS_AT_ONCE))
-    for first in range(0, store.n_texels, step):
-        part = slice(first, min(first + step, store.n_texels))
+    each = SAMPLE_BYTES * store.observed.pairs.size
+    step = int(np.clip(job.resources.block_bytes // each, 1, store.texels_per_chunk))
+    found = job.blocks(folder).map(
+        "mean samples",
+        averages_block,
+        Averaging(store, step),
+        job.base_reader.blocks_of(np.arange(store.n_texels)),
+    )
+    return found.joined("averages")
+
+
+@dataclass(frozen=True, eq=False)
+class Averaging:
+    """What all blocks of texels share whose samples are averaged.
+
+    Parameters
+    ----------
+    store : ObservationStore
+    step : int
+        Texels at a time; the averages do not depend on it.
+    """
+
+    store: ObservationStore
+    step: int
+
+
+def averages_block(context: Averaging, texels: NDArray[np.intp]) -> dict[str, Any]:
+    """Mean observed sample of some adjacent texels."""
+    parts = []
+    observed = context.store.observed
+    for first in range(texels[0], texels[-1] + 1, context.step):
+        part = slice(first, min(first + context.step, texels[-1] + 1))
         seen = observed.views[part, :, None] & observed.lights[part, None, :] & observed.pairs
-        averages[part] = mean_sample(store.read(part), seen)
-    return averages
+        parts.append(mean_sample(context.store.read(part), seen))
+    return {"averages": np.concatenate(parts).astype(np.float32)}
 
 
 def _write_mesh(job: Job, average: NDArray[np.float32], folder: Path) -> None:

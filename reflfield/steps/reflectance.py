@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -10,16 +11,26 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment import Alignment, RefinementOptions, align
+from reflfield.alignment import RefinementOptions, align
 from reflfield.alignment.refinement import SampleSet
-from reflfield.alignment.scattered import refine_scattered
+from reflfield.alignment.scattered import (
+    SharpTargets,
+    improved_block,
+    in_gauge_of,
+    sharp_targets,
+)
+from reflfield.alignment.splines import NodeTargets
 from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
-from reflfield.factorization.inference import infer_coefficients
 from reflfield.field.compression import cluster_completed, fill_unobserved
 from reflfield.field.file import write_field
-from reflfield.field.fit import ClusteredModel, fit_samples
-from reflfield.field.frames import improved_frames
+from reflfield.field.fit import (
+    ClusteredModel,
+    SampleFitOptions,
+    fit_basis,
+    solve_coefficients,
+)
+from reflfield.field.frames import improved_block as turned
 from reflfield.field.model import (
     BaseSurface,
     FittedReflectance,
@@ -27,33 +38,42 @@ from reflfield.field.model import (
     build_field,
 )
 from reflfield.field.residual import sample_error
-from reflfield.observations.projection import project_photographs
+from reflfield.observations.projection import Projection, project_photographs
 from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot
+from reflfield.scheduling import Blocks
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain, versions
-from reflfield.steps.columns import BlockedColumns, half_columns
+from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
 from reflfield.steps.job import Job
+from reflfield.steps.memory import writers_at_once
 from reflfield.steps.options import AlignmentOptions
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
+# Share of the memory that the columns of a completion may take while it is fitted.
+COLUMNS_SHARE = 1 / 3
 # On raw samples: a few rounds, the targets on texels enough for grids of this side.
 REFINEMENT = RefinementOptions(side=25, rounds=4, texels_per_cluster=8192)
 
 
 def write_observations(job: Job, folder: Path) -> dict[str, Any]:
     """Apparent BRDF samples of all texels, on disk."""
-    budget = 2 * job.resources.block_bytes
-    project_photographs(job.training, job.texels.position, job.view_seen, folder, budget)
-    store = job.base_reader.store
+    location = job.samples_location
+    if isinstance(location, Path):
+        location = folder / location.name
+    projection = Projection(
+        job.training, job.texels.position, job.view_seen, location, job.resources.block_bytes
+    )
+    project_photographs(projection, job.blocks(folder), writers_at_once(job))
+    observed = job.observed
     return {
         "photographs": len(job.training.photographs),
-        "samples": int(np.prod(store.observed.views.shape)) * job.training.n_lights,
-        "samples observed": store.observed.count(),
-        "raw bytes": int(np.prod(store.observed.views.shape)) * job.training.n_lights * 6,
+        "samples": int(np.prod(observed.views.shape)) * job.training.n_lights,
+        "samples observed": observed.count(),
+        "raw bytes": int(np.prod(observed.views.shape)) * job.training.n_lights * 6,
     }
 
 
@@ -70,7 +90,7 @@ def write_completion(job: Job, folder: Path) -> dict[str, Any]:
         method=options.method,
         seed=job.options.seed,
         resources=job.resources,
-        scratch=folder,
+        blocks=job.blocks(folder),
     )
     write_completion_arrays(folder / "completion.npz", found, coefficients)
     return {
@@ -88,16 +108,16 @@ def completed(
     seen: Indices,
     *,
     rank: int,
+    resources: Resources,
+    blocks: Blocks,
     passes: int = 4,
     method: Literal["map", "brand"] = "map",
     seed: int = 0,
-    resources: Resources | None = None,
-    scratch: Path | None = None,
 ) -> tuple[Completion, Floats]:
     """Completion shaped by the chosen texels, and coefficients of all.
 
-    The columns of the chosen texels are kept in memory, or in a temporary folder inside
-    `scratch` where they are too many; the result depends on neither.
+    The columns of the chosen texels are kept in memory, or in a temporary folder where they
+    are too many; the result depends on neither.
 
     Returns
     -------
@@ -105,29 +125,42 @@ def completed(
     coefficients : (n_texels, rank) float32
         Zero (the mean) for texels without samples.
     """
-    resources = resources or Resources()
-    block_bytes = resources.block_bytes
-    with TemporaryDirectory(dir=scratch, prefix="columns.") as folder:
-        found = complete(
-            half_columns(
-                BlockedColumns(reader, chosen, block_bytes),
-                resources.max_memory // 4,
-                Path(folder),
-            ),
-            rank=rank,
-            passes=passes,
-            method=method,
-            n_channels=3,
-            seed=seed,
-        )
+    context = Resampling(reader, resources.block_bytes)
+
+    def basis() -> dict[str, NDArray[Any]]:
+        blocks.folder.mkdir(exist_ok=True)
+        with TemporaryDirectory(dir=blocks.folder, prefix="columns.") as folder:
+            columns = half_columns(
+                blocks, context, chosen, int(resources.max_memory * COLUMNS_SHARE), Path(folder)
+            )
+            found = complete(
+                columns, rank=rank, passes=passes, method=method, n_channels=3, seed=seed
+            )
+        return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+
+    found = completion_of(blocks.once("basis", basis))
     coefficients = np.zeros((reader.n_texels, found.rank), np.float32)
     coefficients[chosen] = found.coefficients
     others = np.setdiff1d(seen, chosen)
     if len(others):
-        coefficients[others], _ = infer_coefficients(
-            found, BlockedColumns(reader, others, block_bytes), n_channels=3
+        parts = blocks.map(
+            "completing all texels",
+            inferred,
+            Inference(found, context),
+            reader.blocks_of(others),
         )
+        coefficients[others] = parts.joined("coefficients")
     return found, coefficients
+
+
+def completion_of(stored: dict[str, Any]) -> Completion:
+    """Completion from its entries as arrays."""
+    numbers: dict[str, Any] = {
+        "noise": float(stored["noise"]),
+        "residuals": tuple(stored["residuals"].tolist()),
+        "restarts": int(stored["restarts"]),
+    }
+    return Completion(**{**stored, **numbers})
 
 
 def write_completion_arrays(path: Path, found: Completion, coefficients: Floats) -> None:
@@ -192,17 +225,18 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
     }
     keep = np.zeros(len(job.seen_texels), bool)
     if job.options.alignment.enabled and max(job.sides) > 1:
-        found = aligned(job)
+        blocks = job.blocks(folder)
+        found = blocks.once("harmonic search", lambda: aligned(job))
         seen = job.seen_texels
-        keep = found.margin >= job.options.alignment.least_margin
+        keep = found["margin"] >= job.options.alignment.least_margin
         arrays["aligned"][seen[keep]] = True
-        local_from_base = found.local_from_base
+        local_from_base = found["local_from_base"]
         if job.options.alignment.refine:
-            local_from_base = refined(job, found)
+            local_from_base = refined(job, local_from_base, found["cluster"], blocks)
         frames[seen[keep]] = local_from_base[keep]
         for name in ("cluster", "score", "margin"):
-            arrays[name][seen] = getattr(found, name)
-        arrays["history"] = found.history
+            arrays[name][seen] = found[name]
+        arrays["history"] = found["history"]
     np.savez(folder / "alignment.npz", local_from_base=frames, **arrays)
     n_aligned = int(keep.sum())
     moved = np.degrees(np.arccos(np.clip(frames[:, 2, 2], -1, 1)))
@@ -214,8 +248,8 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
     }
 
 
-def aligned(job: Job) -> Alignment:
-    """Alignment of the completed texels that have samples."""
+def aligned(job: Job) -> dict[str, NDArray[Any]]:
+    """Alignment of the completed texels that have samples: the arrays of `Alignment`."""
     options = job.options.alignment
     stored = job.result("completion", "completion.npz")
     source = CompletedLuminance(
@@ -227,7 +261,7 @@ def aligned(job: Job) -> Alignment:
     )
     view, light = (HemisphereGrid(side).directions for side in job.sides)
     limits = tuple(_band_limit(options.band_limit, d) for d in (view, light))
-    return align(
+    found = align(
         source,
         view,
         light,
@@ -239,6 +273,8 @@ def aligned(job: Job) -> Alignment:
         max_tilt=np.radians(options.max_tilt_deg),
         n_threads=job.resources.workers,
     )
+    names = ("local_from_base", "cluster", "score", "margin", "history")
+    return {name: getattr(found, name) for name in names}
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,16 +318,70 @@ class RawLuminance:
         )
 
 
-def refined(job: Job, found: Alignment) -> NDArray[np.float64]:
-    """Frames of the texels that have samples, refined on these."""
-    return refine_scattered(
-        RawLuminance(job.base_reader, job.seen_texels, job.resources.block_bytes),
-        found.local_from_base,
-        found.cluster,
-        replace(REFINEMENT, spread=np.radians(job.options.alignment.spread_deg)),
-        seed=job.options.seed,
-        n_threads=job.resources.workers,
+@dataclass(frozen=True, eq=False)
+class Refining:
+    """What all blocks of texels whose frames are refined share.
+
+    Parameters
+    ----------
+    source : RawLuminance
+    frames : (n, 3, 3) float64
+        Of the harmonic search.
+    cluster : (n,) int32
+    sharp : SharpTargets
+    """
+
+    source: RawLuminance
+    frames: NDArray[np.float64]
+    cluster: NDArray[np.int32]
+    sharp: SharpTargets
+
+
+def refined_block(context: Refining, rows: Indices) -> dict[str, NDArray[Any]]:
+    """Frames of some texels, refined on their samples."""
+    frames = improved_block(
+        context.source.read(rows), context.frames[rows], context.cluster[rows], context.sharp
     )
+    return {"frames": frames}
+
+
+def refined(
+    job: Job,
+    frames: NDArray[np.float64],
+    cluster: NDArray[np.int32],
+    blocks: Blocks,
+) -> NDArray[np.float64]:
+    """Frames of the texels that have samples: `refine_scattered` by blocks."""
+    seen = job.seen_texels
+    source = RawLuminance(job.base_reader, seen, job.resources.block_bytes)
+    options = replace(REFINEMENT, spread=np.radians(job.options.alignment.spread_deg))
+
+    def targets() -> dict[str, NDArray[Any]]:
+        found = sharp_targets(
+            source,
+            frames,
+            cluster,
+            options,
+            seed=job.options.seed,
+            n_threads=job.resources.workers,
+        )
+        return {
+            "values": found.targets.values,
+            "sides": np.array(found.targets.sides),
+            "side": np.array(found.options.side),
+        }
+
+    found = blocks.once("sharp targets", targets)
+    view_side, light_side = (int(side) for side in found["sides"])
+    sharp = SharpTargets(
+        NodeTargets(found["values"], view_side, light_side),
+        replace(options, side=int(found["side"])),
+    )
+    rows = [np.searchsorted(seen, some) for some in job.base_reader.blocks_of(seen)]
+    parts = blocks.map(
+        "frames on the samples", refined_block, Refining(source, frames, cluster, sharp), rows
+    )
+    return in_gauge_of(frames, parts.joined("frames"), cluster)
 
 
 def _band_limit(wanted: int, directions: NDArray[np.float64]) -> int:
@@ -333,7 +423,7 @@ def write_compressed(
     job: Job, frames: AlignedFrames, made_with: dict[str, Any], folder: Path
 ) -> dict[str, Any]:
     """Fit a field in the given frames, write it, and measure it on the samples."""
-    model, reader = fitted_model(job, frames, folder)
+    model, reader = fitted_model(job, frames, job.blocks(folder))
     made = field_of(job, model, reader.local_from_world, made_with)
     write_field(folder / "field.rfld", made)
     np.savez(folder / "model.npz", residuals=np.array(model.residuals))
@@ -363,7 +453,7 @@ def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
 
 
 def fitted_model(
-    job: Job, frames: AlignedFrames, scratch: Path
+    job: Job, frames: AlignedFrames, blocks: Blocks
 ) -> tuple[ClusteredModel, TexelReader]:
     """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
     options = job.options.compression
@@ -376,17 +466,17 @@ def fitted_model(
         rank=options.rank,
         seed=job.options.seed,
         resources=job.resources,
-        scratch=scratch,
+        blocks=blocks,
     )
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)
     if options.fits_samples(job.observed.count() / len(seen)):
-        model, reader = _fitted_to_samples(job, model, reader, frames.free)
+        model, reader = _fitted_to_samples(job, model, reader, frames.free, blocks)
     return fill_unobserved(model, job.texels.position, seen), reader
 
 
 def _fitted_to_samples(
-    job: Job, model: ClusteredModel, reader: TexelReader, free: Indices
+    job: Job, model: ClusteredModel, reader: TexelReader, free: Indices, blocks: Blocks
 ) -> tuple[ClusteredModel, TexelReader]:
     """Fit to the samples, in frames that are improved on the way where they are free."""
     options = job.options.compression.samples
@@ -394,18 +484,83 @@ def _fitted_to_samples(
     parts = options.halves() if len(free) and spread > 0 else (options,)
     for i, part in enumerate(parts):
         if i > 0:
-            better = improved_frames(reader, model, free, spread, workers=job.resources.workers)
-            reader = reader.rotated(better)
-        model = fit_samples(
+            better = blocks.map(
+                "frames against the model",
+                turned_block,
+                SampleFit(reader, model, spread),
+                reader.blocks_of(free),
+            )
+            frames = reader.local_from_world.copy()
+            frames[free] = better.joined("frames")
+            reader = reader.rotated(frames)
+        model = _fitted_once(job, model, reader, part, blocks, f", part {i + 1}")
+    return model, reader
+
+
+def _fitted_once(
+    job: Job,
+    model: ClusteredModel,
+    reader: TexelReader,
+    options: SampleFitOptions,
+    blocks: Blocks,
+    part: str,
+) -> ClusteredModel:
+    """Basis of some texels, then coefficients of all: `fit_samples` by blocks."""
+
+    def basis() -> dict[str, NDArray[Any]]:
+        found = fit_basis(
             reader.rooted,
             model,
             job.seen_texels,
             reader.sample_bytes_per_texel,
-            part,
+            options,
             workers=job.resources.workers,
             seed=job.options.seed,
         )
-    return model, reader
+        return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+
+    stored: dict[str, Any] = blocks.once(f"basis on the samples{part}", basis)
+    found = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
+    parts = blocks.map(
+        f"coefficients on the samples{part}",
+        coefficients_block,
+        SampleFit(reader, found, 0.0),
+        reader.blocks_of(job.seen_texels),
+    )
+    coefficients = found.coefficients.copy()
+    coefficients[job.seen_texels] = parts.joined("coefficients")
+    return replace(found, coefficients=coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleFit:
+    """What all blocks of texels share that are fitted to their samples.
+
+    Parameters
+    ----------
+    reader : TexelReader
+    model : ClusteredModel
+    spread : float
+        Of the frames, radians.
+    """
+
+    reader: TexelReader
+    model: ClusteredModel
+    spread: float
+
+
+def turned_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
+    """Frames of some texels, improved against the model."""
+    return {"frames": turned(context.reader, context.model, texels, context.spread)}
+
+
+def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
+    """Coefficients of some texels in the basis of the model."""
+    with ThreadPoolExecutor(1) as pool:
+        found, _ = solve_coefficients(
+            context.reader.rooted(texels), context.model.cluster[texels], context.model, pool
+        )
+    return {"coefficients": found}
 
 
 def field_of(

@@ -13,8 +13,8 @@ from reflfield.comparison.heldout import compare_with_photographs
 from reflfield.comparison.metrics import Comparison
 from reflfield.comparison.report import ReportContent, write_report
 from reflfield.field.model import ReflectanceField
+from reflfield.files import replacing
 from reflfield.relighting.renderer import RenderOptions
-from reflfield.stages import replacing
 
 
 def metrics_text(compared: Mapping[str, Any] | None) -> str:

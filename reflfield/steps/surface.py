@@ -3,38 +3,66 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from reflfield.capture.model import Capture
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.atlas import Atlas, build_atlas
 from reflfield.geometry.hull import visual_hull
 from reflfield.geometry.mesh import Mesh, write_ply
 from reflfield.geometry.plane import image_plane
+from reflfield.geometry.texels import TexelTable
 from reflfield.geometry.visibility import (
     RayScene,
+    VisibilityOptions,
     check_light_outside,
     light_visibility,
     view_visibility,
 )
-from reflfield.progress import track
 from reflfield.stages import plain
 from reflfield.steps.job import Job
 from reflfield.steps.options import SMALLEST_TEXTURE
+
+# Views, or lights, of one block.
+DIRECTIONS_AT_ONCE = 8
 
 
 def write_silhouettes(job: Job, folder: Path) -> dict[str, Any]:
     """Coverage of every training view, read or made, as 8-bit arrays."""
     capture = job.training
-    views: dict[str, Any] = {}
-    for i in track(range(capture.n_views), capture.n_views, "silhouettes"):
-        views[f"view{i}"] = np.rint(capture.read_silhouette(i) * 255).astype(np.uint8)
+    found = job.blocks(folder).map(
+        "silhouettes", silhouettes_block, capture, runs(capture.n_views)
+    )
+    views: dict[str, Any] = {
+        name: coverage for arrays in found for name, coverage in arrays.items()
+    }
     np.savez_compressed(folder / "silhouettes.npz", **views)
     given = sum(path is not None for path in capture.silhouettes)
     return {"views": capture.n_views, "silhouettes given": given}
+
+
+def silhouettes_block(capture: Capture, views: range) -> dict[str, Any]:
+    """Coverage of some views, 8 bits."""
+    return {
+        f"view{i}": np.rint(capture.read_silhouette(i) * 255).astype(np.uint8) for i in views
+    }
+
+
+def runs(n: int) -> list[range]:
+    """Views or lights that are handled together.
+
+    Examples
+    --------
+    >>> runs(20)
+    [range(0, 8), range(8, 16), range(16, 20)]
+    """
+    return [range(i, min(i + DIRECTIONS_AT_ONCE, n)) for i in range(0, n, DIRECTIONS_AT_ONCE)]
 
 
 def write_hull(job: Job, folder: Path) -> dict[str, Any]:
@@ -103,23 +131,65 @@ def derived_resolution(job: Job, mesh: Mesh) -> int:
     return int(side)
 
 
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What all blocks of views and lights share whose visibility is traced.
+
+    Parameters
+    ----------
+    capture : Capture
+    texels : TexelTable
+    mesh : Mesh
+    options : VisibilityOptions
+    silhouettes : sequence of (h, w) float32 or None
+        Of the views.
+    threads : int
+        For rays.
+    """
+
+    capture: Capture
+    texels: TexelTable
+    mesh: Mesh
+    options: VisibilityOptions
+    silhouettes: Sequence[NDArray[np.float32] | None]
+    threads: int
+
+
+def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
+    """Which texels some views or lights see, (n_texels, k)."""
+    kind, some = block
+    scene = RayScene(context.mesh, threads=context.threads)
+    capture, texels, options = context.capture, context.texels, context.options
+    if kind == "views":
+        columns = [
+            view_visibility(
+                texels, scene, capture.cameras[i], options, silhouette=context.silhouettes[i]
+            )
+            for i in some
+        ]
+    else:
+        columns = [light_visibility(texels, scene, capture.lights[i], options) for i in some]
+    return {"seen": np.stack(columns, axis=1)}
+
+
 def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
     """Which camera and which light each texel sees."""
     capture, texels = job.training, job.texels
-    scene = RayScene(job.surface_atlas.mesh, threads=job.resources.workers)
-    options = job.options.visibility
-    total = capture.n_views + capture.n_lights
-    views = np.zeros((len(texels), capture.n_views), bool)
-    lights = np.zeros((len(texels), capture.n_lights), bool)
-    for i in track(range(total), total, "visibility"):
-        if i < capture.n_views:
-            silhouette = None if job.is_plane else job.view_silhouettes[i]
-            views[:, i] = view_visibility(
-                texels, scene, capture.cameras[i], options, silhouette=silhouette
-            )
-        else:
-            light = capture.lights[i - capture.n_views]
-            lights[:, i - capture.n_views] = light_visibility(texels, scene, light, options)
+    context = Sight(
+        capture,
+        texels,
+        job.surface_atlas.mesh,
+        job.options.visibility,
+        [None] * capture.n_views if job.is_plane else job.view_silhouettes,
+        job.resources.workers,
+    )
+    view_runs, light_runs = runs(capture.n_views), runs(capture.n_lights)
+    named = [("views", run) for run in view_runs] + [("lights", run) for run in light_runs]
+    # The rays have threads of their own.
+    found = job.blocks(folder).map("visibility", sight_block, context, named, at_once=1)
+    columns = [arrays["seen"] for arrays in found]
+    views = np.concatenate(columns[: len(view_runs)], axis=1)
+    lights = np.concatenate(columns[len(view_runs) :], axis=1)
     if not views.any():
         raise InputError(
             "cameras: expected at least one that sees the surface, found none; check the "

@@ -61,7 +61,8 @@ def planted(model, tmp_path, rng):
         sides=SIDES,
         options=ResamplingOptions(),
     )
-    stored = create_samples(tmp_path / "store", N, 14, 15, 8)
+    stored = create_samples(tmp_path / "store", N, 14, 15)
+    stored[:] = 0
     taps = reader.rooted(np.arange(N))
     parts = model.table.reshape(2, 49, 49, 2, 3)[model.cluster]
     nodes = parts[..., 0, :] + model.coefficients[:, None, None] * parts[..., 1, :]

@@ -10,16 +10,19 @@ from reflfield.capture.images import write_exr
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph
 from reflfield.errors import InputError, ShapeError
-from reflfield.observations import projection
+from reflfield.observations import store
 from reflfield.observations.projection import (
     HALF_MAX,
+    Projection,
     directions_of,
     facing_irradiance,
     pairs_photographed,
     project_photographs,
+    project_views,
     sample_bilinear,
 )
 from reflfield.observations.store import ObservationStore, Observed
+from reflfield.scheduling import Blocks, Scheduler
 
 from .rigs import dome
 
@@ -61,10 +64,12 @@ def project(tmp_path):
         positions = np.asarray(positions, float)
         if visible is None:
             visible = np.ones((len(positions), capture.n_views), bool)
-        project_photographs(capture, positions, visible, tmp_path / "store")
+        folder = tmp_path / f"run{len(list(tmp_path.glob('run*')))}"
+        projection = Projection(capture, positions, visible, folder / "store")
+        project_photographs(projection, Blocks(Scheduler(), folder / "blocks"))
         lights = np.ones((len(positions), capture.n_lights), bool)
         observed = Observed(visible, lights, pairs_photographed(capture))
-        return ObservationStore(tmp_path / "store", observed).read(slice(None))
+        return ObservationStore(folder / "store", observed).read(slice(None))
 
     return run
 
@@ -143,7 +148,7 @@ class TestProjection:
         assert project(capture, [[0, 1, 0]])[0, 0, 0, 0] == 1.5
 
     def test_views_and_lights_keep_their_places(self, capture_of, project, monkeypatch):
-        monkeypatch.setattr(projection, "VIEWS_PER_CHUNK", 2)
+        monkeypatch.setattr(store, "VIEWS_PER_CHUNK", 2)
         number = np.arange(15).reshape(5, 3)[:, :, None, None, None]
         images = np.broadcast_to(number, (5, 3, HEIGHT, WIDTH, 3))
         lights = [Light(f"l{j}", "directional") for j in range(3)]
@@ -217,9 +222,9 @@ class TestProjection:
     def test_shapes(self, capture_of, tmp_path):
         capture = capture_of(np.ones((1, 1, HEIGHT, WIDTH, 3)), [lamp("l0")])
         with pytest.raises(ShapeError, match="positions"):
-            project_photographs(capture, np.zeros((2, 2)), np.ones((2, 1), bool), tmp_path)
+            Projection(capture, np.zeros((2, 2)), np.ones((2, 1), bool), tmp_path)
         with pytest.raises(ShapeError, match="visible"):
-            project_photographs(capture, np.zeros((2, 3)), np.ones((2, 3), bool), tmp_path)
+            Projection(capture, np.zeros((2, 3)), np.ones((2, 3), bool), tmp_path)
 
 
 class TestDirections:
@@ -248,19 +253,12 @@ class TestDirections:
         assert pairs.tolist() == [[True, True, True], [True, True, False]]
 
 
-def test_large_scenes_hold_fewer_views_at_once():
-    # 10 million texels x 32 lights x 6 bytes pass 512 MB with one view.
-    assert projection._views_at_once(10_000_000, 32) == 1
-    assert projection._views_at_once(10, 32) == projection.VIEWS_PER_CHUNK
-    # 2 ** 29 / (2 ** 20 * 16 * 6) = 5.3
-    assert projection._views_at_once(1 << 20, 16) == 5
-
-
 def test_camera_that_images_nothing_is_named(capture_of, tmp_path):
     capture = capture_of(np.ones((1, 1, HEIGHT, WIDTH, 3)), [lamp("l0")])
     perspective = replace(capture.cameras[0], kind="opencv")
     behind = replace(capture, cameras=(perspective,))
     with pytest.raises(InputError, match="pixels"):
-        project_photographs(
-            behind, np.array([[0, 0, 5.0]]), np.ones((1, 1), bool), tmp_path / "s"
+        project_views(
+            Projection(behind, np.array([[0, 0, 5.0]]), np.ones((1, 1), bool), tmp_path / "s"),
+            range(1),
         )

@@ -21,7 +21,7 @@ def reader_of(tmp_path, rng):
 
     def make(capture, samples, *, domain="linear", sides=SIDES, **observed):
         n = len(samples)
-        stored = create_samples(tmp_path / "store", n, capture.n_views, capture.n_lights, 8)
+        stored = create_samples(tmp_path / "store", n, capture.n_views, capture.n_lights)
         stored[:] = samples.astype(np.float16)
         seen = {
             "views": np.ones((n, capture.n_views), bool),

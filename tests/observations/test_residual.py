@@ -32,7 +32,7 @@ def reader_of(field, tmp_path, rng):
     own = own.reshape(n, 5, 6, 3)
 
     def make(factor):
-        stored = create_samples(tmp_path / "store", n, 5, 6, 8)
+        stored = create_samples(tmp_path / "store", n, 5, 6)
         seen = Observed(
             rng.random((n, 5)) < 0.7, rng.random((n, 6)) < 0.7, pairs_photographed(capture)
         )

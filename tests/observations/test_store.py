@@ -1,10 +1,17 @@
-"""Store: what is written by views is read by texels, in any order."""
+"""Store: what is written by views is read by texels, in any order, or found damaged."""
 
 import numpy as np
 import pytest
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.observations.store import ObservationStore, Observed, create_samples
+from reflfield.observations import store
+from reflfield.observations.store import (
+    ObservationStore,
+    Observed,
+    chunk_shape,
+    create_samples,
+    is_written,
+)
 
 
 def all_observed(n_texels, n_views, n_lights):
@@ -16,10 +23,12 @@ def all_observed(n_texels, n_views, n_lights):
 
 
 @pytest.fixture
-def written(tmp_path, rng):
+def written(tmp_path, rng, monkeypatch):
     """A store of 2500 texels (three chunks) written three views at a time, of seven."""
+    monkeypatch.setattr(store, "VIEWS_PER_CHUNK", 3)
+    monkeypatch.setattr(store, "MOST_TEXELS_PER_CHUNK", 1024)
     values = rng.random((2500, 7, 4, 3)).astype(np.float16)
-    samples = create_samples(tmp_path / "store", 2500, 7, 4, 3)
+    samples = create_samples(tmp_path / "store", 2500, 7, 4)
     for first in range(0, 7, 3):
         samples[:, first : first + 3] = values[:, first : first + 3]
     return ObservationStore(tmp_path / "store", all_observed(2500, 7, 4)), values
@@ -27,9 +36,9 @@ def written(tmp_path, rng):
 
 class TestReading:
     def test_groups_of_views_that_do_not_divide_them(self, written):
-        store, values = written
-        assert store.samples.chunks[:2] == (1024, 3)
-        assert np.array_equal(store.read(slice(None)), values)
+        stored, values = written
+        assert stored.samples.chunks[:2] == (1024, 3)
+        assert np.array_equal(stored.read(slice(None)), values)
 
     @pytest.mark.parametrize(
         "texels",
@@ -37,25 +46,60 @@ class TestReading:
         ids=["unsorted", "repeated", "one", "none", "both"],
     )
     def test_by_index(self, written, texels):
-        store, values = written
+        stored, values = written
         texels = np.array(texels, np.intp)
-        assert np.array_equal(store.read(texels), values[texels])
+        assert np.array_equal(stored.read(texels), values[texels])
 
     def test_by_slice_across_chunks(self, written):
-        store, values = written
-        assert np.array_equal(store.read(slice(1000, 2100)), values[1000:2100])
-
-    def test_what_was_never_written_is_zero(self, tmp_path):
-        samples = create_samples(tmp_path / "store", 5, 4, 2, 2)
-        samples[:, :2] = 1
-        store = ObservationStore(tmp_path / "store", all_observed(5, 4, 2))
-        assert (store.read(np.arange(5))[:, 2:] == 0).all()
-        assert (store.read(np.arange(5))[:, :2] == 1).all()
+        stored, values = written
+        assert np.array_equal(stored.read(slice(1000, 2100)), values[1000:2100])
 
     def test_sizes(self, written):
-        store, values = written
-        assert store.n_texels == 2500
-        assert store.raw_bytes() == values.nbytes
+        stored, values = written
+        assert stored.n_texels == 2500
+        assert stored.raw_bytes() == values.nbytes
+
+
+class TestDamage:
+    def test_a_changed_bit_is_found(self, written, tmp_path):
+        stored, values = written
+        chunk = tmp_path / "store" / "c" / "1" / "2" / "0" / "0"
+        data = bytearray(chunk.read_bytes())
+        data[len(data) // 2] ^= 4
+        chunk.write_bytes(data)
+        with pytest.raises(InputError, match=r"store: expected chunks that agree .* --from"):
+            stored.read(np.array([1500]))
+        # Other chunks are as good as ever.
+        assert np.array_equal(stored.read(slice(0, 1024)), values[:1024])
+        assert not is_written(stored.samples, (slice(None), slice(6, 7)))
+        assert is_written(stored.samples, (slice(None), slice(3, 6)))
+
+    def test_a_lost_chunk_is_found(self, written, tmp_path):
+        stored, _ = written
+        (tmp_path / "store" / "c" / "2" / "1" / "0" / "0").unlink()
+        with pytest.raises(InputError, match="found some missing"):
+            stored.read(np.array([5, 2400]))
+        assert not is_written(stored.samples, (slice(None), slice(3, 6)))
+        assert is_written(stored.samples, (slice(None), slice(0, 3)))
+
+    def test_chunks_of_zeros_are_not_taken_for_lost(self, tmp_path):
+        samples = create_samples(tmp_path / "store", 5, 4, 2)
+        assert not is_written(samples, (slice(None), slice(None)))
+        samples[:] = 0
+        assert is_written(samples, (slice(None), slice(None)))
+
+
+class TestObjectStorage:
+    def test_of_fsspec_holds_the_same(self, rng):
+        values = rng.random((300, 9, 5, 3)).astype(np.float16)
+        url = "memory://test_store/samples"
+        create_samples(url, 300, 9, 5)[:] = values
+        stored = ObservationStore(url, all_observed(300, 9, 5))
+        assert np.array_equal(stored.read(np.array([299, 4])), values[[299, 4]])
+
+    def test_a_local_url_is_a_folder(self, tmp_path):
+        create_samples(f"file://{tmp_path}/s", 3, 2, 2)[:] = 1
+        assert (ObservationStore(tmp_path / "s", all_observed(3, 2, 2)).read([0]) == 1).all()
 
 
 class TestCreation:
@@ -63,14 +107,27 @@ class TestCreation:
     def test_counts_of_zero_are_refused(self, tmp_path, name):
         counts = {"texels": 3, "views": 2, "lights": 2, name: 0}
         with pytest.raises(InputError, match=f"{name}: expected at least one, received 0"):
-            create_samples(tmp_path / "s", *counts.values(), 1)
+            create_samples(tmp_path / "s", *counts.values())
         assert not (tmp_path / "s").exists()
 
-    def test_replaces_what_was_there(self, tmp_path):
-        create_samples(tmp_path / "s", 3, 2, 2, 1)[:] = 7
-        assert create_samples(tmp_path / "s", 4, 1, 5, 8).shape == (4, 1, 5, 3)
-        store = ObservationStore(tmp_path / "s", all_observed(4, 1, 5))
-        assert not store.read(slice(None)).any()
+    def test_replaces_one_of_another_shape_and_keeps_its_own(self, tmp_path):
+        create_samples(tmp_path / "s", 3, 2, 2)[:] = 7
+        assert (create_samples(tmp_path / "s", 3, 2, 2)[:] == 7).all()
+        other = create_samples(tmp_path / "s", 4, 1, 5)
+        assert other.shape == (4, 1, 5, 3)
+        assert np.isnan(other[:]).all()
+
+    def test_replaces_what_is_no_array(self, tmp_path):
+        (tmp_path / "s").mkdir()
+        (tmp_path / "s" / "zarr.json").write_text("{")
+        assert create_samples(tmp_path / "s", 3, 2, 2).shape == (3, 2, 2, 3)
+
+    @pytest.mark.parametrize("shape", [(1, 1, 1), (40_000, 149, 149), (200_000, 16, 1)])
+    def test_chunks_are_of_a_useful_size(self, shape):
+        texels, views = chunk_shape(*shape)
+        writer = shape[0] * views * shape[2] * 6
+        assert writer <= 128 << 20
+        assert texels == shape[0] or 256 <= texels <= 4096
 
 
 class TestObserved:

@@ -11,10 +11,15 @@ from reflfield.capture.readers import open_capture
 from reflfield.config import HoldOut, Resources, read_toml, with_tables
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
-from reflfield.observations.projection import project_photographs
-from reflfield.observations.store import ObservationStore
+from reflfield.observations.projection import Projection, project_photographs
 from reflfield.relighting.renderer import Renderer, RenderOptions
-from reflfield.steps.columns import BlockedColumns, half_columns, texels_at_once
+from reflfield.scheduling import Blocks, Scheduler, Tally
+from reflfield.steps.columns import (
+    BlockedColumns,
+    Resampling,
+    half_columns,
+    texels_at_once,
+)
 from reflfield.steps.evaluation import within_memory
 from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory, least_memory
@@ -45,28 +50,30 @@ class TestColumns:
 
     def test_are_the_same_from_files(self, job, tmp_path):
         texels = job.seen_texels[:300]
-        source = BlockedColumns(job.base_reader, texels, GB)
+        context = Resampling(job.base_reader, GB)
+        blocks = Blocks(Scheduler(2), tmp_path / "blocks")
         (tmp_path / "held").mkdir()
-        in_memory = half_columns(source, GB, tmp_path / "held")
-        in_files = half_columns(source, 0, tmp_path)
+        in_memory = half_columns(blocks, context, texels, GB, tmp_path / "held")
+        in_files = half_columns(blocks, context, texels, 0, tmp_path)
         assert list((tmp_path / "held").iterdir()) == []
-        n_bytes = 300 * (source.shape[0] + source.shape[0] // 3) * 2
+        n_bytes = 300 * (in_files.shape[0] + in_files.shape[0] // 3) * 2
         assert sum(p.stat().st_size for p in tmp_path.iterdir() if p.is_file()) == n_bytes
+        assert blocks.tally == Tally(computed=2, resumed=2)
         columns = np.array([299, 0, 256, 5])
         for one, other in zip(in_memory.read(columns), in_files.read(columns), strict=True):
             np.testing.assert_array_equal(one, other)
-        exact, _ = source.read(columns)
+        exact, _ = context.columns(texels[columns])
         # Halves: 11 bits.
         np.testing.assert_allclose(in_files.read(columns)[0], exact, rtol=2**-11, atol=1e-7)
 
 
 def test_projection_does_not_depend_on_the_budget(job, tmp_path):
-    project_photographs(job.training, job.texels.position, job.view_seen, tmp_path / "s", 1)
-    tight = ObservationStore(tmp_path / "s", job.observed).samples
-    ample = job.base_reader.store.samples
-    # One view at a time instead of a chunk's worth.
-    assert tight.chunks[1] == 1 < ample.chunks[1]
-    np.testing.assert_array_equal(tight[:], ample[:])
+    # One photograph at a time instead of many.
+    tight = Projection(job.training, job.texels.position, job.view_seen, tmp_path / "s", 1)
+    project_photographs(tight, Blocks(Scheduler(2), tmp_path / "blocks"), at_once=2)
+    for path in sorted(p for p in (tmp_path / "s").rglob("*") if p.is_file()):
+        ample = job.samples_location / path.relative_to(tmp_path / "s")
+        assert path.read_bytes() == ample.read_bytes(), path
 
 
 def test_pictures_do_not_depend_on_the_block(job, finished):

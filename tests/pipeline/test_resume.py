@@ -6,21 +6,21 @@ import signal
 
 import pytest
 
-# Runs the command; the process kills itself, as SIGKILL does, at the fourth step of
-# progress that is reported while the stage's partial folder exists.
+# Runs the command; the process kills itself, as SIGKILL does, at a step of the progress
+# that is reported while the stage's partial folder exists.
 KILLED_IN = """
 import os, signal, sys
 from pathlib import Path
 import reflfield.cli as cli
 
-partial = Path(sys.argv.pop(1))
+partial, step = Path(sys.argv.pop(1)), int(sys.argv.pop(1))
 
 class Killer:
     def __init__(self, write):
         self.steps = 0
     def __call__(self, description, done, total):
         self.steps += partial.is_dir()
-        if self.steps == 4:
+        if self.steps == step:
             os.kill(os.getpid(), signal.SIGKILL)
 
 cli.ProgressLines = Killer
@@ -39,9 +39,9 @@ def test_killed_in_three_stages_and_run_again(
     out = tmp_path / "run"
     words = ("run", tiny_capture, "-o", out, "--config", tiny_options)
     held = ("--hold-out", "views=1,lights=1")
-    for stage in ("hull", "observations", "compression"):
+    for stage, step in (("hull", 4), ("observations", 2), ("compression", 8)):
         partial = out / "stages" / f"{stage}.partial"
-        killed = subprocess_run("-c", KILLED_IN, partial, *words, *held)
+        killed = subprocess_run("-c", KILLED_IN, partial, step, *words, *held)
         assert killed.status == -signal.SIGKILL
         assert partial.is_dir()
         assert not partial.with_name(stage).exists()

@@ -1,0 +1,340 @@
+"""Pure functions over numbered blocks: on threads here or on a cluster, kept as they finish.
+
+The result of a block depends on its context and its number alone, and is written to a file
+of its own, with a checksum, before it counts. So a killed run goes on where it stopped, a
+lost worker costs the blocks that it was at, and the same bytes come out whoever works.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import dask
+import distributed
+import numpy as np
+from dask.callbacks import Callback
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+from reflfield.errors import InputError
+from reflfield.files import replacing
+from reflfield.progress import report
+
+Arrays: TypeAlias = Mapping[str, NDArray[Any]]
+# What computes one block: from the context that all blocks share and the block itself.
+BlockFunction: TypeAlias = Callable[[Any, Any], Arrays]
+Keep: TypeAlias = Callable[[int, Any], None]
+
+# How often a block is tried again whose worker was lost or failed.
+RETRIES = 3
+CONNECTING_SECONDS = 30
+
+
+def one_core_blas() -> AbstractContextManager[object]:
+    """Keep the BLAS from threads of its own: the blocks have theirs, and two layers fight."""
+    return _thread_pools().limit(limits=1, user_api="blas")
+
+
+@lru_cache(maxsize=1)
+def _thread_pools() -> ThreadpoolController:
+    """Libraries with threads in this process; finding them takes milliseconds."""
+    return ThreadpoolController()
+
+
+@lru_cache(maxsize=1)
+def _limit_worker() -> None:
+    """Give the BLAS of a cluster's worker one thread, for good: its tasks overlap."""
+    ThreadpoolController().limit(limits=1, user_api="blas")
+
+
+def _on_worker(function: BlockFunction, context: Any, block: Any) -> Any:
+    _limit_worker()
+    return function(context, block)
+
+
+def _same(context: Any) -> Any:
+    return context
+
+
+@dataclass(frozen=True)
+class Scheduler:
+    """Who computes the blocks; nothing of it changes what they give.
+
+    Parameters
+    ----------
+    workers : int
+        Threads of this process.
+    address : str, optional
+        Of the scheduler of a `dask.distributed` cluster, such as ``tcp://host:8786``; its
+        workers compute in place of the threads.
+    """
+
+    workers: int = 1
+    address: str | None = None
+
+    def run(
+        self,
+        function: BlockFunction,
+        context: Any,
+        blocks: Mapping[int, Any],
+        keep: Keep,
+        *,
+        at_once: int | None = None,
+        done: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Compute blocks, in any order.
+
+        Parameters
+        ----------
+        function : callable
+            ``function(context, block)``; for a cluster, context and block can be pickled.
+        context : object
+            Shared by all blocks.
+        blocks : mapping of int to object
+        keep : callable
+            Called once for each block with its number and its result.
+        at_once : int, optional
+            At most so many threads, where memory allows no more.
+        done : callable
+            Called after each block, from this thread.
+
+        Raises
+        ------
+        InputError
+            If no scheduler answers at `address`.
+        """
+        if not blocks:
+            return
+        if self.address is not None:
+            self._on_cluster(function, context, blocks, keep, done)
+            return
+        threads = max(1, min(self.workers, at_once or self.workers, len(blocks)))
+
+        def compute(number: int) -> None:
+            keep(number, function(context, blocks[number]))
+
+        tasks = [
+            dask.delayed(compute, pure=False)(number, dask_key_name=f"block-{i:08d}")
+            for i, number in enumerate(blocks)
+        ]
+        finished = Callback(posttask=lambda *_: done())
+        # Of one's own, to be left when no block is at work any more, also after an error.
+        with one_core_blas(), ThreadPoolExecutor(threads) as pool, finished:
+            dask.compute(*tasks, scheduler="threads", pool=pool)
+
+    def _on_cluster(
+        self,
+        function: BlockFunction,
+        context: Any,
+        blocks: Mapping[int, Any],
+        keep: Keep,
+        done: Callable[[], None],
+    ) -> None:
+        with self._client() as client, client.as_current(), warnings.catch_warnings():
+            # The context is one large argument, sent once; as a task it outlives its worker.
+            warnings.filterwarnings("ignore", message="Sending large graph")
+            shared = client.submit(_same, context, pure=False, retries=RETRIES)
+            number_of = {
+                client.submit(
+                    _on_worker, function, shared, block, pure=False, retries=RETRIES
+                ): number
+                for number, block in blocks.items()
+            }
+            for future in distributed.as_completed(list(number_of)):
+                keep(number_of.pop(future), future.result())
+                done()
+
+    def _client(self) -> distributed.Client:
+        try:
+            return distributed.Client(
+                self.address, timeout=CONNECTING_SECONDS, set_as_default=False
+            )
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler: expected a dask scheduler at {self.address}, found none "
+                f"({error}); start one with `dask scheduler`"
+            ) from error
+
+
+@dataclass(frozen=True)
+class BlockFiles:
+    """Results of numbered blocks, each in a file that begins with its checksum.
+
+    Parameters
+    ----------
+    folder : Path
+        Created with the first block.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> files = BlockFiles(Path(tempfile.mkdtemp()) / "sums")
+    >>> files.write(3, {"sum": np.array(6)})
+    >>> int(files.read(3)["sum"]), files.read(4)
+    (6, None)
+    """
+
+    folder: Path
+
+    def path(self, number: int) -> Path:
+        """File of a block."""
+        return self.folder / f"{number:06d}.block"
+
+    def write(self, number: int, arrays: Arrays) -> None:
+        """Write a block's result, whole or not at all."""
+        text = io.BytesIO()
+        np.savez(text, **dict(arrays))  # type: ignore[arg-type]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with replacing(self.path(number)) as unfinished:
+            unfinished.write_bytes(hashlib.sha256(text.getbuffer()).digest() + text.getbuffer())
+
+    def read(self, number: int) -> dict[str, NDArray[Any]] | None:
+        """Result of a block; None if it is absent or damaged."""
+        try:
+            data = self.path(number).read_bytes()
+        except FileNotFoundError:
+            return None
+        digest, text = data[:32], memoryview(data)[32:]
+        if hashlib.sha256(text).digest() != digest:
+            return None
+        with np.load(io.BytesIO(text), allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+
+
+@dataclass(frozen=True)
+class Results(Sequence[dict[str, NDArray[Any]]]):
+    """Results of all blocks of one work, read from their files as they are asked for."""
+
+    files: BlockFiles
+    n_blocks: int
+
+    def __len__(self) -> int:
+        return self.n_blocks
+
+    def __getitem__(self, number: Any) -> Any:
+        if not 0 <= number < self.n_blocks:
+            raise IndexError(number)
+        found = self.files.read(number)
+        if found is None:
+            raise InputError(
+                f"{self.files.path(number)}: expected the block that was written, found it "
+                "gone or damaged; leave the folder alone and run again"
+            )
+        return found
+
+    def joined(self, name: str) -> NDArray[Any]:
+        """One array of all blocks, end to end."""
+        return np.concatenate([arrays[name] for arrays in self])
+
+
+@dataclass
+class Tally:
+    """Blocks that one stage computed, and those that an interrupted run had left."""
+
+    computed: int = 0
+    resumed: int = 0
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Work of one stage, by blocks.
+
+    Parameters
+    ----------
+    scheduler : Scheduler
+    folder : Path
+        Where results are kept until the stage is complete.
+    tally : Tally
+        Counts what is computed and what is found.
+    """
+
+    scheduler: Scheduler
+    folder: Path
+    tally: Tally = field(default_factory=Tally)
+
+    def map(
+        self,
+        name: str,
+        function: BlockFunction,
+        context: Any,
+        blocks: Sequence[Any],
+        *,
+        intact: Callable[[Any, Any], bool] | None = None,
+        at_once: int | None = None,
+    ) -> Results:
+        """Results of a function on all blocks, in their order.
+
+        Parameters
+        ----------
+        name : str
+            Of this work within its stage.
+        function : callable
+            ``function(context, block)`` gives arrays by name.
+        context : object
+        blocks : sequence
+            The same ones whatever the resources, so that a run can be taken up.
+        intact : callable, optional
+            ``intact(context, block)``: whether what the block wrote elsewhere is still there.
+        at_once : int, optional
+            See `Scheduler.run`.
+
+        Returns
+        -------
+        Results
+            One for each block, read when it is asked for.
+        """
+        files = BlockFiles(self.folder / name)
+        kept = self._kept(files, context, blocks, intact)
+        left = {n: block for n, block in enumerate(blocks) if n not in kept}
+        self.tally.resumed += len(kept)
+        report(name, len(kept), len(blocks))
+
+        def done() -> None:
+            self.tally.computed += 1
+            finished = self.tally.computed - before
+            report(name, len(kept) + finished, len(blocks))
+
+        before = self.tally.computed
+        self.scheduler.run(function, context, left, files.write, at_once=at_once, done=done)
+        return Results(files, len(blocks))
+
+    def _kept(
+        self,
+        files: BlockFiles,
+        context: Any,
+        blocks: Sequence[Any],
+        intact: Callable[[Any, Any], bool] | None,
+    ) -> set[int]:
+        """Blocks whose results, and what they wrote elsewhere, are there and verified."""
+        found = {n: block for n, block in enumerate(blocks) if files.read(n) is not None}
+        if intact is None:
+            return set(found)
+        answers: dict[int, bool] = {}
+        self.scheduler.run(
+            partial(_checked, intact), context, found, answers.__setitem__, at_once=1
+        )
+        return {n for n, answer in answers.items() if answer}
+
+    def once(self, name: str, compute: Callable[[], Arrays]) -> dict[str, NDArray[Any]]:
+        """Result of work that cannot be cut into blocks, done in this process and kept."""
+        files = BlockFiles(self.folder / name)
+        found = files.read(0)
+        if found is not None:
+            self.tally.resumed += 1
+            return found
+        files.write(0, compute())
+        self.tally.computed += 1
+        return Results(files, 1)[0]
+
+
+def _checked(intact: Callable[[Any, Any], bool], context: Any, block: Any) -> Any:
+    return intact(context, block)

@@ -1,0 +1,146 @@
+"""Blocks: the same results whoever computes them, kept as they finish, found if damaged."""
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reflfield.errors import InputError
+from reflfield.progress import listening
+from reflfield.scheduling import BlockFiles, Blocks, Scheduler, Tally
+
+
+def square(context, block):
+    """A block of the tests."""
+    return {"square": np.array(context * block**2)}
+
+
+class Fails:
+    """Function of blocks that fails at one of them, and remembers all."""
+
+    def __init__(self, at):
+        self.at, self.seen = at, []
+
+    def __call__(self, context, block):
+        self.seen.append(block)
+        if block == self.at:
+            raise InputError(f"block {block}: damaged")
+        return square(context, block)
+
+
+class TestBlocks:
+    @pytest.mark.parametrize("workers", [1, 3])
+    def test_results_come_in_the_order_of_the_blocks(self, tmp_path, workers):
+        blocks = Blocks(Scheduler(workers), tmp_path)
+        found = blocks.map("squares", square, 2, [5, 3, 4, 1])
+        assert [int(arrays["square"]) for arrays in found] == [50, 18, 32, 2]
+        assert blocks.tally == Tally(computed=4)
+
+    def test_what_is_there_is_not_computed_again(self, tmp_path):
+        first = Fails(at=3)
+        blocks = Blocks(Scheduler(), tmp_path)
+        with pytest.raises(InputError, match="block 3: damaged"):
+            blocks.map("squares", first, 2, list(range(6)))
+        finished = set(first.seen) - {3}
+        again, tally = Fails(at=None), Tally()
+        found = Blocks(Scheduler(2), tmp_path, tally).map("squares", again, 2, list(range(6)))
+        assert sorted(again.seen) == sorted(set(range(6)) - finished)
+        assert tally == Tally(computed=6 - len(finished), resumed=len(finished))
+        assert [int(arrays["square"]) for arrays in found] == [2 * n * n for n in range(6)]
+
+    @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
+    def test_damaged_results_are_computed_again(self, tmp_path, damage):
+        blocks = Blocks(Scheduler(), tmp_path)
+        blocks.map("squares", square, 2, [1, 2, 3])
+        path = BlockFiles(tmp_path / "squares").path(1)
+        data = path.read_bytes()
+        changed = data[:-50] + bytes([data[-50] ^ 1]) + data[-49:]
+        path.write_bytes({"cut": data[:-9], "changed": changed, "empty": b""}[damage])
+        again = Fails(at=None)
+        found = blocks.map("squares", again, 2, [1, 2, 3])
+        assert again.seen == [2]
+        assert int(found[1]["square"]) == 8
+
+    def test_results_whose_other_traces_are_gone_are_computed_again(self, tmp_path):
+        blocks = Blocks(Scheduler(2), tmp_path)
+        blocks.map("squares", square, 2, [1, 2, 3])
+        again = Fails(at=None)
+        blocks.map("squares", again, 2, [1, 2, 3], intact=lambda context, block: block != 3)
+        assert again.seen == [3]
+
+    def test_one_step_is_kept_too(self, tmp_path):
+        calls = []
+
+        def step():
+            calls.append(1)
+            return {"found": np.arange(3)}
+
+        blocks = Blocks(Scheduler(), tmp_path)
+        for _ in range(2):
+            assert blocks.once("step", step)["found"].tolist() == [0, 1, 2]
+        assert calls == [1]
+
+    def test_threads_work_at_the_same_time_but_not_more_than_allowed(self, tmp_path):
+        working, most = [], []
+
+        def wait(context, block):
+            working.append(block)
+            most.append(len(working))
+            time.sleep(0.05)
+            working.remove(block)
+            return {"thread": np.array(threading.get_ident())}
+
+        found = Blocks(Scheduler(3), tmp_path).map("free", wait, None, range(6))
+        assert max(most) > 1
+        assert len({int(arrays["thread"]) for arrays in found}) == 3
+        most.clear()
+        Blocks(Scheduler(3), tmp_path).map("one", wait, None, range(3), at_once=1)
+        assert max(most) == 1
+
+    def test_progress_counts_what_was_there(self, tmp_path):
+        blocks, heard = Blocks(Scheduler(), tmp_path), []
+        blocks.map("squares", square, 1, [0, 1, 2])
+        BlockFiles(tmp_path / "squares").path(2).unlink()
+        with listening(lambda *words: heard.append(words)):
+            blocks.map("squares", square, 1, [0, 1, 2])
+        assert heard == [("squares", 2, 3), ("squares", 3, 3)]
+
+    def test_a_result_that_vanishes_is_named(self, tmp_path):
+        found = Blocks(Scheduler(), tmp_path).map("squares", square, 1, [1, 2])
+        BlockFiles(tmp_path / "squares").path(1).unlink()
+        with pytest.raises(InputError, match=r"000001.block: expected the block"):
+            found.joined("square")
+
+
+class TestCluster:
+    def test_address_without_a_scheduler(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("reflfield.scheduling.CONNECTING_SECONDS", 0.3)
+        blocks = Blocks(Scheduler(1, "tcp://127.0.0.1:9"), tmp_path)
+        with pytest.raises(InputError, match="--scheduler: expected a dask scheduler at tcp"):
+            blocks.map("squares", square, 1, [1])
+
+    def test_a_lost_worker_costs_its_blocks(self, tmp_path, cluster):
+        # Inside the test, so that the workers need not find this file.
+        def process_of(folder, block):
+            (Path(folder) / f"{block}.{os.getpid()}").write_text("")
+            if block == 2 and not (Path(folder) / "killed").exists():
+                (Path(folder) / "killed").write_text(str(os.getpid()))
+                os._exit(9)
+            time.sleep(0.05)
+            return {"process": np.array(os.getpid()), "square": np.array(block**2)}
+
+        tally = Tally()
+        blocks = Blocks(Scheduler(1, cluster), tmp_path / "blocks", tally)
+        found = blocks.map("processes", process_of, str(tmp_path), range(12))
+        assert [int(arrays["square"]) for arrays in found] == [n**2 for n in range(12)]
+        assert os.getpid() not in {int(arrays["process"]) for arrays in found}
+        assert tally == Tally(computed=12)
+        # Begun twice: blocks of the worker that was lost, and no other.
+        lost = (tmp_path / "killed").read_text()
+        begun = [path.name.split(".") for path in tmp_path.glob("*.*")]
+        twice = {n for n, _ in begun if sum(other == n for other, _ in begun) > 1}
+        assert twice <= {n for n, process in begun if process == lost}
+        assert "2" in twice
