@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +15,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -24,6 +25,7 @@ from capture_sim.dome import rig_presets
 from capture_sim.effects.registry import read_choice
 from capture_sim.errors import SceneError
 from capture_sim.materials import material_presets
+from capture_sim.memory import parse_bytes
 from capture_sim.objects import object_presets
 from capture_sim.plan import plan as make_plan
 from capture_sim.record import table_lines
@@ -66,6 +68,9 @@ def render(
     workers: Annotated[int, typer.Option(min=1, help="Views rendered at the same time.")] = min(
         os.cpu_count() or 1, 8
     ),
+    max_memory: Annotated[
+        str, typer.Option(metavar="SIZE", help="Ceiling of resident memory, such as 800MB.")
+    ] = "4GB",
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier capture in the folder.")
     ] = False,
@@ -80,14 +85,14 @@ def render(
     for note in loaded.mesh.notes:
         print(f"capture-sim: repaired {note}", file=sys.stderr)
     with _progress_bar() as bar:
-        task = bar.add_task("views", total=None)
         write_capture(
             loaded,
             output,
             workers=workers,
+            max_memory=parse_bytes(max_memory),
             overwrite=overwrite,
             n_contributions=contributions,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=_shown_by(bar),
         )
     for line in [*table_lines(output), f"Wrote {output}"]:
         _console().print(line, highlight=False, soft_wrap=True, markup=False)
@@ -137,6 +142,19 @@ def _progress_bar() -> Progress:
         console=Console(stderr=True),
         transient=True,
     )
+
+
+def _shown_by(bar: Progress) -> Callable[[int, int], None]:
+    """Report that begins where an earlier call stopped, so that the time left is right."""
+    tasks: list[TaskID] = []
+
+    def report(done: int, total: int) -> None:
+        if tasks:
+            bar.update(tasks[0], completed=done)
+        else:
+            tasks.append(bar.add_task("photographs", completed=done, total=total))
+
+    return report
 
 
 def _console() -> Console:

@@ -114,6 +114,11 @@ def _described(scene: Scene, effect: Effect) -> bool:
     return in_every_scene or scene.effects.declared(effect.Options) is not None
 
 
+def n_described(scene: Scene) -> int:
+    """How many effects the scene says enough about to simulate them."""
+    return sum(_described(scene, effect) for effect in EFFECTS)
+
+
 def arriving(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> tuple[Images, float]:
     """Some photographs before the sensor, and the processor seconds that they took.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,21 @@ from capture_sim.objects import SurfaceMesh
 
 _LARGEST_HALF = float(np.finfo(np.float16).max)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # zip members carry a date; this is the earliest
+
+
+def write_whole(path: Path, write: Callable[[Path, Any], None], values: Any) -> None:
+    """Write a file under another name first: what has its name is whole.
+
+    Parameters
+    ----------
+    path : Path
+    write : callable
+        Writes values to a path.
+    values : object
+    """
+    beginning = path.with_name(f".{path.name}")
+    write(beginning, values)
+    beginning.rename(path)
 
 
 def write_exr(path: Path, radiance: NDArray[np.float32]) -> None:

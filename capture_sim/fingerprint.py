@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from capture_sim.model import Blocks
 from capture_sim.stopwatch import Stopwatch
 
 
@@ -22,7 +23,8 @@ def fingerprint(value: Any) -> str:
     ----------
     value : object
         Made of dataclasses, mappings, sequences, sets, arrays, functions with their
-        closures, and what `repr` tells apart. Stopwatches count as nothing.
+        closures, and what `repr` tells apart. Stopwatches and sizes of blocks count as
+        nothing: no file depends on them.
 
     Returns
     -------
@@ -55,7 +57,7 @@ def _source() -> bytes:
 def _parts(value: Any) -> list[bytes]:
     """Bytes that tell a value from others, part by part."""
     name = [type(value).__name__.encode()]
-    if isinstance(value, Stopwatch):
+    if isinstance(value, Stopwatch | Blocks):
         return name
     if isinstance(value, np.ndarray):
         return [*name, str((value.dtype, value.shape)).encode(), value.tobytes()]

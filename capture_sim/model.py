@@ -115,6 +115,38 @@ class TruthOptions:
 
 
 @dataclass(frozen=True)
+class Blocks:
+    """How much is worked on at once; no result depends on it.
+
+    Attributes
+    ----------
+    block : int
+        Bytes of temporaries of one piece of work: rays, pairs of point and light, paths.
+    images : int
+        Bytes of the photographs of one view that are held before they are written.
+    tables : int
+        Bytes of what is kept for all views: light below the surface.
+    lights : int
+        Lamps that are worked on at once, with what is kept of each for all views.
+    """
+
+    block: int = 50 << 20
+    images: int = 1 << 28
+    tables: int = 1 << 30
+    lights: int = 1 << 24
+
+    def items(self, each: int) -> int:
+        """How many items of so many bytes make a block.
+
+        Examples
+        --------
+        >>> Blocks(block=1000).items(30), Blocks(block=1000).items(3000)
+        (33, 1)
+        """
+        return max(1, self.block // each)
+
+
+@dataclass(frozen=True)
 class Scene:
     """Everything that determines a simulated capture.
 
@@ -139,6 +171,8 @@ class Scene:
         Of its photographs, for decisions about effects.
     costs : Stopwatch
         Collects the time that each effect takes.
+    blocks : Blocks
+        How much is worked on at once.
     """
 
     name: str
@@ -155,6 +189,7 @@ class Scene:
     seed: int = 1
     brightness: Brightness = field(default_factory=Brightness)
     costs: Stopwatch = field(default_factory=Stopwatch, compare=False)
+    blocks: Blocks = field(default_factory=Blocks, compare=False)
 
     def __post_init__(self) -> None:
         for what, items in (("cameras", self.cameras), ("lights", self.lights)):

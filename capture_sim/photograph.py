@@ -23,10 +23,10 @@ from capture_sim.effects import (
     vignetting,
 )
 from capture_sim.effects.rig import real_rig
-from capture_sim.model import Scene
+from capture_sim.model import Scene, Table
 from capture_sim.placement import check_outside
 from capture_sim.rays import RayTracer
-from capture_sim.render import ViewSamples, render_view, sample_view, shade
+from capture_sim.render import ViewSamples, render_view, sample_view
 from capture_sim.visibility import TracedLights
 
 Float32 = NDArray[np.float32]
@@ -153,12 +153,22 @@ def _lit_by_lamps(
 def _lit_by_area(scene: Scene, tracer: RayTracer, view: ViewSamples, light: int) -> Float32:
     with scene.costs.measure(light_extent.NAME):
         patches = light_extent.apply(scene, scene.lights[light])
-        return np.asarray(shade(scene, tracer, view, patches).sum(axis=0))
+        return _lit_together(scene, tracer, view, patches)
 
 
 def _room_light(scene: Scene, tracer: RayTracer, view: ViewSamples) -> Float32:
     with scene.costs.measure(environment.NAME):
-        return np.asarray(shade(scene, tracer, view, environment.apply(scene)).sum(axis=0))
+        return _lit_together(scene, tracer, view, environment.apply(scene))
+
+
+def _lit_together(
+    scene: Scene, tracer: RayTracer, view: ViewSamples, lights: tuple[Table, ...]
+) -> Float32:
+    """One photograph under all of the lights."""
+    total = np.zeros((*view.coverage.shape, 3), dtype=np.float32)
+    for _, radiance in render_view(replace(scene, lights=lights), tracer, view):
+        total += radiance
+    return total
 
 
 def _through_lens(scene: Scene, radiance: Float32, frame: Frame) -> Float32:

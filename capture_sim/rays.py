@@ -21,6 +21,8 @@ from capture_sim.objects import SurfaceMesh
 Array = NDArray[np.float64]
 CameraDict = Mapping[str, Any]
 
+# Temporaries of a ray and its hit.
+BYTES_PER_RAY = 200
 # Undistortion is a fixed-point iteration; 1e-12 of the focal length is far below float32 rays.
 _LENS_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4")
 _UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)

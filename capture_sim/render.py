@@ -26,6 +26,7 @@ from capture_sim.arrival import LightArrays
 from capture_sim.effects import (
     antialiasing,
     interreflection,
+    light_extent,
     near_lights,
     shadows,
     simulated,
@@ -33,20 +34,16 @@ from capture_sim.effects import (
 )
 from capture_sim.materials import Material
 from capture_sim.model import Scene
-from capture_sim.rays import RayTracer, camera_rays, towards_camera
-from capture_sim.shading import direct_light
+from capture_sim.rays import BYTES_PER_RAY, RayTracer, camera_rays, towards_camera
+from capture_sim.shading import BYTES_PER_PAIR, direct_light
 from capture_sim.surface import SurfacePoints, surface_points
-from capture_sim.visibility import TracedLights, trace_lights, worth_tracing
+from capture_sim.visibility import Nodes, TracedLights, trace_lights, worth_tracing
 
 Table = Mapping[str, Any]
 Array = NDArray[np.float64]
 
-# Pairs of point and light shaded at once: temporaries stay near 50 MB.
-PAIRS_PER_BLOCK = 1 << 16
-# Values of all photographs of one view held at once, before they are written.
-VALUES_PER_BATCH = 1 << 25
-# Rays searched for outlines at once.
-RAYS_PER_BLOCK = 1 << 19
+# Bytes of a value of a photograph while it is gathered, and once more light by light.
+BYTES_PER_VALUE = 8
 # A jump along the ray within a pixel above this part of the object's radius is an edge.
 EDGE_STEP = 0.04
 # What light does between parts of the object, beyond shining on it.
@@ -104,17 +101,18 @@ def sample_view(scene: Scene, tracer: RayTracer, camera: Table) -> ViewSamples:
     step = EDGE_STEP * scene.mesh.radius
     n_pixels = int(camera["h"]) * int(camera["w"])
     search = per_side if per_side == per_side_at_edges else max(per_side, 2)
-    found = _trace_pixels(tracer, camera, np.arange(n_pixels), search)
+    rays = scene.blocks.items(BYTES_PER_RAY)
+    found = _trace_pixels(tracer, camera, np.arange(n_pixels), search, rays)
     covered, edge = found.coverage, np.zeros(n_pixels, dtype=bool)
     samples = found.samples
     if per_side_at_edges > per_side:
         with scene.costs.measure(antialiasing.NAME):
             near = np.flatnonzero(_near_outline(found, int(camera["w"]), step))
-            finer = _trace_pixels(tracer, camera, near, per_side_at_edges)
+            finer = _trace_pixels(tracer, camera, near, per_side_at_edges, rays)
         covered[near], edge[near] = finer.coverage, finer.crossed(step)
         if search != per_side:
             inside = np.flatnonzero((covered > 0.0) & ~edge)
-            samples = _trace_pixels(tracer, camera, inside, per_side).samples
+            samples = _trace_pixels(tracer, camera, inside, per_side, rays).samples
         samples = samples.where(~edge[samples.pixel]).joined(
             finer.samples.where(edge[finer.samples.pixel])
         )
@@ -191,10 +189,10 @@ class TracedPixels:
 
 
 def _trace_pixels(
-    tracer: RayTracer, camera: Table, pixels: NDArray[np.intp], per_side: int
+    tracer: RayTracer, camera: Table, pixels: NDArray[np.intp], per_side: int, rays: int
 ) -> TracedPixels:
-    """Trace a grid of rays through each of some pixels, block by block."""
-    rows = max(1, RAYS_PER_BLOCK // per_side**2)
+    """Trace a grid of rays through each of some pixels, so many rays at once."""
+    rows = max(1, rays // per_side**2)
     starts = range(0, max(len(pixels), 1), rows)
     parts = [
         _trace_block(tracer, camera, pixels[first : first + rows], per_side) for first in starts
@@ -401,7 +399,7 @@ def _lit_pixels(
     between = [effect for effect in TRANSPORT_EFFECTS if simulated(scene, effect)]
     pixels, row = np.unique(view.pixel, return_inverse=True)
     radiance = np.zeros((len(pixels), 3, len(lights)), dtype=np.float32)
-    step = max(1, PAIRS_PER_BLOCK // len(lights))
+    step = scene.blocks.items(len(lights) * BYTES_PER_PAIR)
     for first in range(0, len(view.points), step):
         block = slice(first, first + step)
         points, weight = view.points[block], view.weight[block].astype(np.float32)
@@ -462,7 +460,9 @@ def _by_light(radiance: _Values, by_light: _Values) -> None:
                     by_light[k, n, c] = radiance[n, c, k]
 
 
-def traced_lights(scene: Scene, tracer: RayTracer) -> TracedLights | None:
+def traced_lights(
+    scene: Scene, tracer: RayTracer, lights: NDArray[np.intp] | None = None
+) -> TracedLights | None:
     """Visibility of the scene's lights all over the object, where that saves work.
 
     Parameters
@@ -470,18 +470,37 @@ def traced_lights(scene: Scene, tracer: RayTracer) -> TracedLights | None:
     scene : Scene
     tracer : RayTracer
         Of the scene's mesh.
+    lights : (n,) int, optional
+        Indices of those that are wanted; all by default.
 
     Returns
     -------
     TracedLights or None
-        None if shadows are off, or views are so few that every ray of theirs is traced.
+        None if shadows are off, lamps have an area, or views are so few that every ray of
+        theirs is traced.
     """
-    paths = scene.effects.get(interreflection.Options).paths
-    nodes = worth_tracing(scene, 1 + paths * simulated(scene, interreflection))
+    nodes = lookup_nodes(scene)
     if nodes is None:
         return None
     with scene.costs.measure(shadows.NAME):
-        return trace_lights(scene, tracer, LightArrays.of(scene, scene.lights), nodes)
+        return trace_lights(scene, tracer, nodes, lights)
+
+
+def lookup_nodes(scene: Scene) -> Nodes | None:
+    """Where visibility is traced beforehand, if anywhere.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    Nodes or None
+    """
+    if simulated(scene, light_extent):
+        return None  # each lamp is many, of one photograph only
+    paths = scene.effects.get(interreflection.Options).paths
+    return worth_tracing(scene, 1 + paths * simulated(scene, interreflection))
 
 
 def render_view(
@@ -507,7 +526,7 @@ def render_view(
     photograph : (h, w, 3) float32
         Linear radiance without noise.
     """
-    step = max(1, VALUES_PER_BATCH // (3 * view.coverage.size))
+    step = max(1, scene.blocks.images // (3 * BYTES_PER_VALUE * view.coverage.size))
     for first in range(0, len(scene.lights), step):
         lights = scene.lights[first : first + step]
         chosen = np.arange(first, first + len(lights))

@@ -16,6 +16,9 @@ from capture_sim.visibility import TracedLights, lit_pairs
 
 Floats = NDArray[np.floating[Any]]
 
+# Temporaries of a pair of point and light: 140 with compiled BRDFs, measured tables take most.
+BYTES_PER_PAIR = 800
+
 
 def direct_light(
     scene: Scene,

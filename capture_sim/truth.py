@@ -22,18 +22,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.files import write_exr, write_json, write_npz, write_ply, write_silhouette
+from capture_sim.files import (
+    write_exr,
+    write_json,
+    write_npz,
+    write_ply,
+    write_silhouette,
+    write_whole,
+)
 from capture_sim.heldout import heldout_pairs, transforms_frame
 from capture_sim.model import Scene
 from capture_sim.rays import Hits, RayTracer, camera_rays, towards_camera, world_from_camera
 from capture_sim.render import (
-    PAIRS_PER_BLOCK,
     arriving_light,
     lit_pairs,
     reflectance_of_pairs,
     sample_view,
     shade,
 )
+from capture_sim.shading import BYTES_PER_PAIR
 from capture_sim.surface import SurfacePoints, spread_points, surface_points
 
 Table = Mapping[str, Any]
@@ -75,7 +82,7 @@ def write_truth(
 
 
 def write_view_truth(scene: Scene, tracer: RayTracer, camera: Table, folder: Path) -> None:
-    """Write the truth of one camera to ``truth/views/<camera>.npz``.
+    """Write the truth of one camera to ``truth/views/<camera>.npz``, unless it is there.
 
     Parameters
     ----------
@@ -87,9 +94,10 @@ def write_view_truth(scene: Scene, tracer: RayTracer, camera: Table, folder: Pat
     folder : Path
         The capture.
     """
-    target = folder / "truth" / "views"
-    target.mkdir(parents=True, exist_ok=True)
-    write_npz(target / f"{camera['id']}.npz", view_truth(scene, tracer, camera))
+    target = folder / "truth" / "views" / f"{camera['id']}.npz"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.is_file():
+        write_whole(target, write_npz, view_truth(scene, tracer, camera))
 
 
 def view_truth(scene: Scene, tracer: RayTracer, camera: Table) -> Arrays:
@@ -163,7 +171,7 @@ def lights_visible(scene: Scene, tracer: RayTracer, points: SurfacePoints) -> ND
         True where the light is above the shading horizon and not hidden.
     """
     visible = np.zeros((len(points), len(scene.lights)), dtype=bool)
-    step = max(1, PAIRS_PER_BLOCK // len(scene.lights))
+    step = scene.blocks.items(len(scene.lights) * BYTES_PER_PAIR)
     for first in range(0, len(points), step):
         block = points[first : first + step]
         arriving = arriving_light(scene, scene.lights, block.position)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from capture_sim.arrival import LightArrays
 from capture_sim.effects import shadows, simulated
-from capture_sim.model import Scene
+from capture_sim.model import Scene, Table
 from capture_sim.objects import SurfaceMesh
-from capture_sim.rays import RayTracer, world_from_camera
+from capture_sim.rays import BYTES_PER_RAY, RayTracer, world_from_camera
 from capture_sim.surface import SurfacePoints, shadow_starts
 
 Array = NDArray[np.float64]
@@ -31,7 +31,8 @@ WORD = 64  # lights in a word of bits
 PIXELS_BETWEEN_NODES = 2.0
 MOST_PER_SIDE = 512  # steps along the sides of one triangle
 MOST_NODES = 1 << 23  # with 151 lights 200 MB
-RAYS_PER_BLOCK = 1 << 20
+# Temporaries of a node while lights are traced from it, besides those of its rays.
+BYTES_PER_NODE = 600
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,16 @@ class Nodes:
     def __len__(self) -> int:
         return int(self.first[-1])
 
-    def places(self) -> tuple[NDArray[np.int64], Array]:
-        """Face (n_nodes,) and barycentric position (n_nodes, 3) of each node."""
-        face = np.repeat(np.arange(len(self.per_side)), np.diff(self.first))
-        second_third = np.zeros((len(self), 2))
-        _fill_places(self.per_side, self.first, second_third)
-        return face, np.hstack([1.0 - second_third.sum(axis=1, keepdims=True), second_third])
+    def places(
+        self, start: int = 0, stop: int | None = None
+    ) -> tuple[NDArray[np.int64], Array]:
+        """Face (n,) and barycentric position (n, 3) of nodes; of all by default."""
+        chosen = np.arange(start, len(self) if stop is None else min(stop, len(self)))
+        face = np.searchsorted(self.first, chosen, side="right") - 1
+        second_third = np.zeros((len(chosen), 2))
+        _fill_places(self.per_side, self.first, face, chosen, second_third)
+        barycentric = np.hstack([1.0 - second_third.sum(axis=1, keepdims=True), second_third])
+        return face, barycentric
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ class TracedLights:
     bits : (n_nodes, n_words) uint64
         Bit ``b % 64`` of word ``b // 64`` is set if the light of bit `b` is not hidden.
     bit : (n_lights,) int64
-        Bit of each light.
+        Bit of each light of the scene; -1 where it has not been traced.
     """
 
     nodes: Nodes
@@ -148,49 +153,71 @@ def worth_tracing(scene: Scene, queries_per_point: int = 1) -> Nodes | None:
     return nodes if 2 * len(nodes) < queries and len(nodes) <= MOST_NODES else None
 
 
+def pixels_across(scene: Scene, camera: Table) -> float:
+    """Pixels that a camera has across the object's bounding sphere.
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : dict
+        Camera of the native capture format.
+
+    Returns
+    -------
+    float
+    """
+    distance = float(np.linalg.norm(world_from_camera(camera)[:3, 3] - scene.mesh.centre))
+    depth = 1.0 if camera["model"] == "orthographic" else distance
+    return 2.0 * scene.mesh.radius * float(max(camera["fl_x"], camera["fl_y"])) / depth
+
+
 def _pixel_size(scene: Scene) -> float:
     """Metres across the finest pixel of any camera at the object's centre."""
-    sizes = []
-    for camera in scene.cameras:
-        distance = np.linalg.norm(world_from_camera(camera)[:3, 3] - scene.mesh.centre)
-        focal = max(camera["fl_x"], camera["fl_y"])
-        sizes.append((1.0 if camera["model"] == "orthographic" else distance) / focal)
-    return float(min(sizes))
+    across = max(pixels_across(scene, camera) for camera in scene.cameras)
+    return 2.0 * scene.mesh.radius / across
 
 
 def trace_lights(
-    scene: Scene, tracer: RayTracer, lights: LightArrays, nodes: Nodes
+    scene: Scene,
+    tracer: RayTracer,
+    nodes: Nodes,
+    chosen: NDArray[np.intp] | None = None,
 ) -> TracedLights:
-    """Trace rays from all nodes to all lights.
+    """Trace rays from all nodes to lights.
 
     Parameters
     ----------
     scene : Scene
     tracer : RayTracer
         Of the scene's mesh.
-    lights : LightArrays
     nodes : Nodes
+    chosen : (n,) int, optional
+        Indices of the lights that are wanted; all by default.
 
     Returns
     -------
     TracedLights
     """
-    face, barycentric = nodes.places()
-    starts, normals = shadow_starts(scene.mesh, face, barycentric, tracer.start_offset)
+    if chosen is None:
+        chosen = np.arange(len(scene.lights))
+    lights = LightArrays.of(scene, tuple(scene.lights[light] for light in chosen))
     bits = np.zeros((len(nodes), -(-len(lights) // WORD)), dtype=np.uint64)
-    step = max(1, RAYS_PER_BLOCK // len(lights))
+    step = scene.blocks.items(BYTES_PER_NODE + len(lights) * BYTES_PER_RAY)
     for first in range(0, len(nodes), step):
-        block = slice(first, first + step)
-        wanted = _above(starts[block], normals[block], lights)
+        face, barycentric = nodes.places(first, first + step)
+        starts, normals = shadow_starts(scene.mesh, face, barycentric, tracer.start_offset)
+        wanted = _above(starts, normals, lights)
         seen = np.zeros(wanted.shape, dtype=bool)
         point, light = np.nonzero(wanted)
-        origins = starts[block][point]
+        origins = starts[point]
         seen[point, light] = ~tracer.occluded(origins, lights.targets(light, origins))
         packed = np.packbits(seen, axis=1, bitorder="little")
         padded = np.zeros((len(seen), 8 * bits.shape[1]), dtype=np.uint8)
         padded[:, : packed.shape[1]] = packed
-        bits[block] = padded.view("<u8")
-    return TracedLights(nodes, bits, np.arange(len(lights)))
+        bits[first : first + step] = padded.view("<u8")
+    bit = np.full(len(scene.lights), -1)
+    bit[chosen] = np.arange(len(lights))
+    return TracedLights(nodes, bits, bit)
 
 
 def _above(starts: Array, normals: Array, lights: LightArrays) -> Flags:
@@ -250,16 +277,21 @@ _Values = NDArray[Any]
 
 
 @_compiled
-def _fill_places(per_side: _Values, first: _Values, second_third: _Values) -> None:
-    """Grid positions (i, j) / k with i + j <= k of every triangle, row by row."""
-    for face in range(len(per_side)):
-        k = per_side[face]
-        at = first[face]
-        for i in range(k + 1):
-            for j in range(k + 1 - i):
-                second_third[at, 0] = i / k
-                second_third[at, 1] = j / k
-                at += 1
+def _fill_places(
+    per_side: _Values, first: _Values, face: _Values, chosen: _Values, second_third: _Values
+) -> None:
+    """Grid positions (i, j) / k with i + j <= k of nodes; a triangle's lie row by row."""
+    i = j = 0
+    for n in range(len(chosen)):
+        k = per_side[face[n]]
+        if n > 0 and face[n] == face[n - 1]:
+            j += 1
+        else:
+            i, j = 0, chosen[n] - first[face[n]]
+        while j > k - i:
+            i, j = i + 1, j - (k + 1 - i)
+        second_third[n, 0] = i / k
+        second_third[n, 1] = j / k
 
 
 @_compiled

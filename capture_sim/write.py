@@ -8,6 +8,7 @@ stays in the hidden folder, each file of it whole, and the same command goes on 
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
@@ -22,8 +23,15 @@ from capture_sim.contributions import contributions, some_pairs
 from capture_sim.effects import Frame, exposure_brackets, simulated
 from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
-from capture_sim.files import write_exr, write_json, write_png, write_silhouette
+from capture_sim.files import (
+    write_exr,
+    write_json,
+    write_png,
+    write_silhouette,
+    write_whole,
+)
 from capture_sim.fingerprint import fingerprint
+from capture_sim.memory import fitted
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup, photographs, set_up
 from capture_sim.rays import RayTracer
@@ -34,12 +42,13 @@ from capture_sim.truth import write_truth, write_view_truth
 from capture_sim.visibility import TracedLights
 
 Table = Mapping[str, Any]
+Lights = NDArray[np.intp]
 
 GENERATOR = "capture_sim"
 CAPTURE_FILE = "capture.json"
 FINGERPRINT_FILE = "scene.sha256"
 
-# (views done, views in all); called once more for the truth that is not per view.
+# (photographs done, photographs in all); first with those that are there already.
 Progress = Callable[[int, int], None]
 
 
@@ -48,6 +57,7 @@ def write_capture(
     folder: Path,
     *,
     workers: int = 1,
+    max_memory: int | None = None,
     overwrite: bool = False,
     n_contributions: int = 0,
     progress: Progress | None = None,
@@ -59,16 +69,20 @@ def write_capture(
     scene : Scene
         What to simulate.
     folder : Path
-        Written as a whole at the end; the bytes do not depend on `workers`. Photographs
-        of the same scene that an interrupted call left are taken over.
+        Written as a whole at the end; the bytes depend neither on `workers` nor on
+        `max_memory`. Photographs of the same scene that an interrupted call left are
+        taken over.
     workers : int
         Views rendered at the same time.
+    max_memory : int, optional
+        Ceiling of this process' resident memory, bytes; see `capture_sim.memory`.
     overwrite : bool
         True to replace an earlier capture there; anything else is kept.
     n_contributions : int
         Photographs for which it is written what each effect contributed to them.
     progress : callable, optional
-        Called with the steps done and their total number.
+        Called with the photographs done and their total number, by any thread but by one
+        at a time.
 
     Returns
     -------
@@ -78,17 +92,17 @@ def write_capture(
     Raises
     ------
     SceneError
-        If the folder exists and may not be replaced.
+        If the folder exists and may not be replaced, or the memory does not suffice.
     """
     check_target(folder, overwrite=overwrite)
-    part = _begun(scene, folder)
     # One thread traces at a time, on behalf of all.
     tracer = RayTracer(scene.mesh, n_threads=workers)
-    setup = set_up(measured(scene, tracer))
-    report, steps = progress or _no_progress, len(scene.cameras) + 1
-    _write_views(setup, tracer, part, workers, report)
+    known = measured(scene, tracer)
+    if max_memory is not None:
+        known = fitted(known, workers, max_memory, n_contributions=n_contributions)
+    setup, part = set_up(known), _begun(scene, folder)
+    _write_views(setup, tracer, part, workers, progress or _no_progress)
     _write_rest(setup, tracer, part, n_contributions)
-    report(steps, steps)
     (part / FINGERPRINT_FILE).unlink()
     _move_into_place(part, folder)
     return folder
@@ -155,23 +169,73 @@ def _move_into_place(part: Path, folder: Path) -> None:
     shutil.rmtree(old)
 
 
+class _Tally:
+    """Counts photographs for many threads and reports them.
+
+    Parameters
+    ----------
+    done, total : int
+    progress : callable
+    """
+
+    def __init__(self, done: int, total: int, progress: Progress) -> None:
+        self._done, self._total, self._progress = done, total, progress
+        self._lock = threading.Lock()
+        progress(done, total)
+
+    def add_one(self) -> None:
+        """One more is there."""
+        with self._lock:
+            self._done += 1
+            self._progress(self._done, self._total)
+
+
 def _write_views(
     setup: Setup, tracer: RayTracer, folder: Path, workers: int, progress: Progress
 ) -> None:
-    traced = traced_lights(setup.real, tracer)
     for name in ("photographs", "silhouettes"):
         (folder / name).mkdir(exist_ok=True)
-    views = range(len(setup.scene.cameras))
-    steps = len(views) + 1
-    progress(0, steps)
+    scene = setup.real
+    wanted = setup.rig.taken & _missing(scene, folder)
+    total = int(setup.rig.taken.sum())
+    tally = _Tally(total - int(wanted.sum()), total, progress)
+    for lights in _groups(scene):
+        traced = traced_lights(scene, tracer, lights) if wanted[:, lights].any() else None
+
+        def write_view(
+            view: int, lights: Lights = lights, traced: TracedLights | None = traced
+        ) -> None:
+            chosen = lights[wanted[view, lights]]
+            _write_view(scene, tracer, traced, view, chosen, folder, tally)
+
+        _for_all(len(scene.cameras), write_view, workers)
+
+
+def _missing(scene: Scene, folder: Path) -> NDArray[np.bool_]:
+    """True for photographs that are not there yet, (n_views, n_lights)."""
+    there = {path.name for path in (folder / "photographs").iterdir()}
+
+    def missing(camera: Table, light: Table) -> bool:
+        return not all(Path(file).name in there for file in _files(scene, camera, light))
+
+    return np.array(
+        [[missing(camera, light) for light in scene.lights] for camera in scene.cameras]
+    )
+
+
+def _groups(scene: Scene) -> list[Lights]:
+    """Lights that are worked on together; all of them unless memory is short."""
+    n_lights, step = len(scene.lights), scene.blocks.lights
+    return np.split(np.arange(n_lights), range(step, n_lights, step))
+
+
+def _for_all(count: int, work: Callable[[int], None], workers: int) -> None:
+    """Do some work for all indices, some of them at the same time; stop at an error."""
     with ThreadPoolExecutor(workers) as pool:
-        futures = [
-            pool.submit(_write_view, setup, tracer, traced, view, folder) for view in views
-        ]
+        futures = [pool.submit(work, index) for index in range(count)]
         try:
-            for done, future in enumerate(as_completed(futures), start=1):
+            for future in as_completed(futures):
                 future.result()
-                progress(done, steps)
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -189,19 +253,22 @@ def _write_rest(setup: Setup, tracer: RayTracer, folder: Path, n_contributions: 
 
 
 def _write_view(
-    setup: Setup, tracer: RayTracer, traced: TracedLights | None, index: int, folder: Path
+    scene: Scene,
+    tracer: RayTracer,
+    traced: TracedLights | None,
+    index: int,
+    lights: Lights,
+    folder: Path,
+    tally: _Tally,
 ) -> None:
-    scene = setup.real
     camera = scene.cameras[index]
-    files = [_files(scene, camera, light) for light in scene.lights]
-    missing = [not all((folder / file).is_file() for file in names) for names in files]
-    lights = np.flatnonzero(setup.rig.taken[index] & missing)
     silhouette = folder / _silhouette(camera)
     if len(lights) or not silhouette.is_file():
         view = sample_view(scene, tracer, camera)
         for frame, radiance in photographs(scene, tracer, index, lights, view, traced):
             _write_photograph(scene, folder, frame, radiance)
-        _whole(silhouette, write_silhouette, view.coverage)
+            tally.add_one()
+        write_whole(silhouette, write_silhouette, view.coverage)
     if scene.truth.per_view:
         write_view_truth(scene, tracer, camera, folder)
 
@@ -219,19 +286,12 @@ def _write_photograph(
     camera, light = frame.camera, scene.lights[frame.light]
     if not simulated(scene, exposure_brackets):
         values = exposed(scene, radiance, frame)
-        _whole(folder / _photograph(camera["id"], light["id"]), write_exr, values)
+        write_whole(folder / _photograph(camera["id"], light["id"]), write_exr, values)
         return
     for index, exposure in enumerate(_exposures(scene, camera, light)):
         bracket = replace(frame, exposure=index, seconds=exposure["seconds"])
         values = exposed(scene, radiance, bracket)
-        _whole(folder / exposure["file"], write_png, exposure_brackets.apply(values))
-
-
-def _whole(path: Path, write: Callable[[Path, Any], None], values: Any) -> None:
-    """Write a file under another name first: what has its name is whole."""
-    beginning = path.with_name(f".{path.name}")
-    write(beginning, values)
-    beginning.rename(path)
+        write_whole(folder / exposure["file"], write_png, exposure_brackets.apply(values))
 
 
 def _photograph(camera: str, light: str) -> str:

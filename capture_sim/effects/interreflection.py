@@ -53,8 +53,9 @@ STAGE = Stage.TRANSPORT
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
-# Pairs of path and light at once: temporaries stay near 50 MB.
-PAIRS_PER_BLOCK = 1 << 18
+# Temporaries of a path, and of what it brings of one light.
+BYTES_PER_PATH = 1200
+BYTES_BROUGHT = 200
 # Points and directions that form factors and albedos are measured with.
 TRIAL_POINTS, TRIAL_DIRECTIONS = 1024, 256
 # Highlights steeper than this, 1/rad, are too narrow for these directions.
@@ -158,7 +159,7 @@ def apply(
 
 def _blocks(scene: Scene, points: SurfacePoints, lights: LightArrays) -> list[slice]:
     paths = scene.effects.get(Options).paths
-    step = max(1, PAIRS_PER_BLOCK // (paths * len(lights)))
+    step = scene.blocks.items(paths * (BYTES_PER_PATH + len(lights) * BYTES_BROUGHT))
     return [slice(first, first + step) for first in range(0, len(points), step)]
 
 

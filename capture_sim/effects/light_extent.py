@@ -116,7 +116,13 @@ def apply(scene: Scene, light: Table) -> tuple[dict[str, Any], ...]:
     key = "irradiance" if light["type"] == "directional" else "intensity"
     share = (np.asarray(light[key], np.float64) / options.samples).tolist()
     return tuple(
-        {**light, **_placed(light, offset, towards, options), key: share} for offset in offsets
+        {
+            **light,
+            **_placed(light, offset, towards, options),
+            "id": f"{light['id']}_{i}",
+            key: share,
+        }
+        for i, offset in enumerate(offsets)
     )
 
 

@@ -42,7 +42,7 @@ from capture_sim.materials.translucent import Translucent
 from capture_sim.model import Scene
 from capture_sim.objects import SurfaceMesh
 from capture_sim.rays import RayTracer
-from capture_sim.shading import direct_light
+from capture_sim.shading import BYTES_PER_PAIR, direct_light
 from capture_sim.surface import SurfacePoints, surface_points
 from capture_sim.tables import bounded
 from capture_sim.visibility import Nodes, TracedLights
@@ -57,10 +57,9 @@ Float32 = NDArray[np.float32]
 REACH = 9.0
 # Nodes that cell sizes are refused beyond: their pairs would take hours.
 MOST_NODES = 200_000
-# Light of bodies that is kept for other views, of one scene.
-MOST_BYTES = 1 << 30
-# Pairs of nodes, and of node and light, at once.
-PAIRS_PER_BLOCK = 1 << 22
+# Light of a body that is kept for other views, and the irradiance that it is made of.
+BYTES_KEPT = 12
+BYTES_PER_PAIR_OF_NODE = 8
 # Values of the profile that are tabulated: a hundredth of the light's depth apart.
 TABLE = 1 << 13
 # The profile is replaced by its integral within so many steps of the grid.
@@ -170,22 +169,26 @@ def _body_light(
     with _finding:
         kept = _found.setdefault(tracer, {})
         if key not in kept:
+            nodes = _nodes(scene, material)
+            _make_room(kept, scene.blocks.tables - BYTES_KEPT * len(nodes) * len(lights))
             kept[key] = _scattered(scene, tracer, material, lights)
-            while len(kept) > 1 and sum(body.nbytes for _, body in kept.values()) > MOST_BYTES:
-                del kept[next(iter(kept))]  # the oldest
+        kept[key] = kept.pop(key)  # the last that was asked for
         return kept[key]
+
+
+def _make_room(kept: dict[int, tuple[Nodes, Float32]], bytes_left: int) -> None:
+    """Forget what has not been asked for longest."""
+    while kept and sum(body.nbytes for _, body in kept.values()) > bytes_left:
+        del kept[next(iter(kept))]
 
 
 def _spacing(scene: Scene, material: Translucent) -> float:
     return min(material.length) / scene.effects.get(Options).steps
 
 
-def _scattered(
-    scene: Scene, tracer: RayTracer, material: Translucent, lights: LightArrays
-) -> tuple[Nodes, Float32]:
-    """Nodes and the radiance of the body there, (n_nodes, 3, n_lights)."""
-    spacing = _spacing(scene, material)
-    nodes = Nodes.of(scene.mesh, spacing)
+def _nodes(scene: Scene, material: Translucent) -> Nodes:
+    """The grid; a `SceneError` if its pairs would take hours."""
+    nodes = Nodes.of(scene.mesh, _spacing(scene, material))
     if len(nodes) > MOST_NODES:
         raise scene_error(
             "effects.subsurface.steps",
@@ -193,33 +196,45 @@ def _scattered(
             f"{len(nodes)} for a diffusion length of {min(material.length):g} m",
             "lower steps, lengthen material.length, or switch the effect off",
         )
-    face, barycentric = nodes.places()
-    points = surface_points(scene.mesh, material, face, barycentric)
+    return nodes
+
+
+def bytes_per_light(scene: Scene) -> int:
+    """Memory that one light takes for all views; 0 for materials that are not translucent."""
+    if not isinstance(scene.material, Translucent):
+        return 0
+    return (BYTES_KEPT + BYTES_PER_PAIR_OF_NODE) * len(_nodes(scene, scene.material))
+
+
+def _scattered(
+    scene: Scene, tracer: RayTracer, material: Translucent, lights: LightArrays
+) -> tuple[Nodes, Float32]:
+    """Nodes and the radiance of the body there, (n_nodes, 3, n_lights)."""
+    nodes = _nodes(scene, material)
+    points = surface_points(scene.mesh, material, *nodes.places())
     shining = _irradiance(scene, tracer, points, lights)
     area = node_areas(scene.mesh, nodes)
+    near = STEPS_NEARBY * _spacing(scene, material)
     body = np.zeros((len(nodes), 3, len(lights)), dtype=np.float32)
     for channel, dipole in enumerate(material.dipoles):
-        flux = (shining * lights.colour[:, channel]).astype(np.float32)
-        near = STEPS_NEARBY * spacing
+        flux = shining * lights.colour[:, channel].astype(np.float32)
         inside = float(dipole.within(np.array(near)))
         reach = REACH * dipole.length
         table = dipole.profile(np.linspace(0.0, reach, TABLE)).astype(np.float32)
-        for block, others in _neighbours(points.position, reach):
-            weight = np.zeros((len(block), len(others)), dtype=np.float32)
-            taken = np.zeros(len(block))
-            _weigh(points.position, area, block, others, table, reach, near, weight, taken)
-            total = weight @ flux[others]
-            total += (inside - taken)[:, None].astype(np.float32) * flux[block]
-            body[block, channel] = np.maximum(total, 0.0) / np.pi
+        for cell, others in _neighbours(points.position, reach):
+            _exchange(
+                points.position, area, cell, others, table, reach, near, inside, flux,
+                body[:, channel],
+            )  # fmt: skip
     return nodes, body
 
 
 def _irradiance(
     scene: Scene, tracer: RayTracer, points: SurfacePoints, lights: LightArrays
-) -> Array:
+) -> Float32:
     """Irradiance over the lights' colours, (n, n_lights)."""
-    shining = np.zeros((len(points), len(lights)))
-    step = max(1, PAIRS_PER_BLOCK // (16 * len(lights)))
+    shining = np.zeros((len(points), len(lights)), dtype=np.float32)
+    step = scene.blocks.items(len(lights) * BYTES_PER_PAIR)
     for first in range(0, len(points), step):
         block = slice(first, first + step)
         here = points[block]
@@ -250,7 +265,7 @@ def node_areas(mesh: SurfaceMesh, nodes: Nodes) -> Array:
 def _neighbours(
     positions: Array, reach: float
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Blocks of nodes close together, and all nodes in reach of any of them."""
+    """Cells of nodes close together, and all nodes in reach of any of them."""
     tree = cKDTree(positions)
     cells = np.floor(positions / reach).astype(np.int64)
     order = np.lexsort(cells.T)
@@ -258,10 +273,7 @@ def _neighbours(
     for cell in np.split(order, starts):
         centre = positions[cell].mean(axis=0)
         radius = np.linalg.norm(positions[cell] - centre, axis=1).max()
-        others = np.array(tree.query_ball_point(centre, radius + reach), dtype=np.intp)
-        step = max(1, PAIRS_PER_BLOCK // len(others))
-        for first in range(0, len(cell), step):
-            yield cell[first : first + step], others
+        yield cell, np.array(tree.query_ball_point(centre, radius + reach), dtype=np.intp)
 
 
 _compiled = numba.njit(cache=True, nogil=True)
@@ -269,37 +281,65 @@ _Values = NDArray[Any]
 
 
 @_compiled
-def _weigh(
+def _distance(a: _Values, b: _Values) -> Any:
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@_compiled
+def _from_table(table: _Values, place: Any) -> Any:
+    """Linear interpolation between entries."""
+    i = min(int(place), len(table) - 2)
+    return (1.0 - (place - i)) * table[i] + (place - i) * table[i + 1]
+
+
+@_compiled
+def _finish(total: _Values, rest: Any, flux: _Values, body: _Values) -> None:
+    """Radiance from the radiosity of others and the rest of a node's own."""
+    for k in range(len(total)):
+        body[k] = max(total[k] + rest * flux[k], np.float32(0.0)) / np.float32(np.pi)
+
+
+@_compiled
+def _exchange(
     positions: _Values,
     area: _Values,
-    block: _Values,
+    cell: _Values,
     others: _Values,
     table: _Values,
     reach: float,
     near: float,
-    weight: _Values,
-    taken: _Values,
+    inside: float,
+    flux: _Values,
+    body: _Values,
 ) -> None:
-    """Profile, from a table over [0, reach], times area for pairs of nodes in reach.
+    """Radiance at the nodes of a cell (n_nodes, n_lights) by the flux at all in reach.
 
-    `taken` is the sum over those that are near.
+    The profile comes from a table over [0, reach]. Each light is summed by itself, in the
+    order of the nodes: not a bit depends on what others there are, as in a product of
+    matrices.
     """
     scale = (len(table) - 1) / reach
-    for n in range(len(block)):
-        x, y, z = positions[block[n]]
-        for m in range(len(others)):
-            at = positions[others[m]]
-            squared = (at[0] - x) ** 2 + (at[1] - y) ** 2 + (at[2] - z) ** 2
-            if squared >= reach * reach:
-                continue
-            distance = np.sqrt(squared)
-            place = distance * scale
-            i = min(int(place), len(table) - 2)
-            t = place - i
-            value = ((1.0 - t) * table[i] + t * table[i + 1]) * area[others[m]]
-            weight[n, m] = value
-            if distance < near:
-                taken[n] += value
+    rows = 8  # nodes that take their part of a flux while it is in the cache
+    total = np.zeros((rows, flux.shape[1]), dtype=flux.dtype)
+    taken = np.zeros(rows)
+    for first in range(0, len(cell), rows):
+        block = cell[first : first + rows]
+        total[:] = 0.0
+        taken[:] = 0.0
+        for m in others:
+            for r in range(len(block)):
+                distance = _distance(positions[m], positions[block[r]])
+                if distance >= reach:
+                    continue
+                value = _from_table(table, distance * scale) * area[m]
+                if distance < near:
+                    taken[r] += value
+                weight = np.float32(value)
+                for k in range(total.shape[1]):
+                    total[r, k] += weight * flux[m, k]
+        for r in range(len(block)):
+            # Near the node the profile's integral stands for its sum.
+            _finish(total[r], np.float32(inside - taken[r]), flux[block[r]], body[block[r]])
 
 
 @_compiled

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from capture_sim.files import write_exr
+from capture_sim.memory import parse_bytes
 from capture_sim.model import EffectOptions, TruthOptions
 from capture_sim.rays import RayTracer, towards_camera
 from capture_sim.render import (
@@ -144,17 +145,20 @@ def report(scene, n_views):
     assert errors[1] < 1e-3, "visibility at nodes is no longer next to exact"
 
 
-def write_whole(scene, workers):
+def write_whole(scene, workers, max_memory):
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
         start, spent = time.perf_counter(), time.process_time()
-        write_capture(scene, Path(folder) / "capture", workers=workers)
+        write_capture(
+            scene, Path(folder) / "capture", workers=workers, max_memory=max_memory
+        )
         wall, spent = time.perf_counter() - start, time.process_time() - spent
         files = [f for f in Path(folder).rglob("*") if f.is_file()]
         size = sum(file.stat().st_size for file in files)
     n = len(scene.cameras) * len(scene.lights)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"whole capture, {workers} workers: {n} photographs in {wall:.0f} s, {spent:.0f} s "
-          f"of the processor, {size / 1e9:.2f} GB, peak memory {peak:.1f} GB")  # fmt: skip
+          f"of the processor, {size / 1e9:.2f} GB, peak memory {peak:.2f} GB of "
+          f"{max_memory / 2**30:.2f} allowed")  # fmt: skip
 
 
 def main():
@@ -166,11 +170,12 @@ def main():
     parser.add_argument("--views", type=int, default=4, help="that are timed")
     parser.add_argument("--whole", action="store_true", help="write the whole capture too")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--max-memory", default="4GB", help="ceiling of the whole capture")
     options = parser.parse_args()
     scene = dome(options.rig, options.object, options.material, options.side)
     report(scene, options.views)
     if options.whole:
-        write_whole(scene, options.workers)
+        write_whole(scene, options.workers, parse_bytes(options.max_memory))
 
 
 if __name__ == "__main__":

@@ -213,12 +213,26 @@ def test_fingerprints_tell_scenes_apart(changed):
     assert fingerprint(scene(**changed)) != fingerprint(scene())
 
 
-def test_progress_counts_views_and_truth(tmp_path):
-    steps = []
-    write_capture(
-        scene(), tmp_path / "c", progress=lambda done, total: steps.append((done, total))
-    )
-    assert steps == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
+def test_progress_counts_photographs(tmp_path, monkeypatch):
+    """By one, whichever thread writes them; and on from where an earlier call stopped."""
+    steps, whole = [], capture_sim.write.write_exr
+
+    def failing(path, values):
+        if len(steps) == 5:
+            raise OSError("disk full")
+        whole(path, values)
+
+    def report(done, total):
+        steps.append((done, total))
+
+    monkeypatch.setattr(capture_sim.write, "write_exr", failing)
+    with pytest.raises(OSError, match="disk full"):
+        write_capture(scene(), tmp_path / "c", progress=report)
+    assert steps == [(n, 9) for n in range(5)]
+    monkeypatch.setattr(capture_sim.write, "write_exr", whole)
+    steps.clear()
+    write_capture(scene(), tmp_path / "c", workers=3, progress=report)
+    assert steps == [(n, 9) for n in range(4, 10)]
 
 
 def test_the_reader_reads_the_writer(capture):
