@@ -159,6 +159,10 @@ def run(
         str | None,
         typer.Option(metavar="ADDRESS", help="Of a dask cluster that computes the blocks."),
     ] = None,
+    store: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Folder or fsspec URL for the texels' samples."),
+    ] = None,
     format: Format = None,
 ) -> None:
     """Make a relightable field of a capture, with a report."""
@@ -168,7 +172,7 @@ def run(
 
     started = time.perf_counter()
     options = pipeline_options(config, set_ or [])
-    resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler)
+    resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler, store)
     held = parse_hold_out(hold_out)
     opened = open_capture(capture, format)
     with showing_progress(GOES_ON):

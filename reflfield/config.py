@@ -221,11 +221,14 @@ class Resources:
         Bytes of resident memory that the blocks are sized for.
     scheduler : str, optional
         Address of a `dask.distributed` scheduler, whose workers compute the blocks.
+    store : str, optional
+        Folder, or URL for fsspec, that holds the samples of all texels.
     """
 
     workers: int = 2
     max_memory: int = 4 << 30
     scheduler: str | None = None
+    store: str | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import io
+import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -238,10 +239,28 @@ class Results(Sequence[dict[str, NDArray[Any]]]):
 
 @dataclass
 class Tally:
-    """Blocks that one stage computed, and those that an interrupted run had left."""
+    """Blocks that one stage computed, and those that an interrupted run had left.
+
+    Parameters
+    ----------
+    computed, resumed : int
+    cpu_seconds : dict of str to float
+        Of the processor, this process only, by the name of the work.
+    """
 
     computed: int = 0
     resumed: int = 0
+    cpu_seconds: dict[str, float] = field(default_factory=dict, compare=False)
+
+    @contextmanager
+    def timing(self, name: str) -> Iterator[None]:
+        """Add the processor time of the block to a work."""
+        started = time.process_time()
+        try:
+            yield
+        finally:
+            spent = time.process_time() - started
+            self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + spent
 
 
 @dataclass(frozen=True)
@@ -304,7 +323,10 @@ class Blocks:
             report(name, len(kept) + finished, len(blocks))
 
         before = self.tally.computed
-        self.scheduler.run(function, context, left, files.write, at_once=at_once, done=done)
+        with self.tally.timing(name):
+            self.scheduler.run(
+                function, context, left, files.write, at_once=at_once, done=done
+            )
         return Results(files, len(blocks))
 
     def _kept(
@@ -331,7 +353,8 @@ class Blocks:
         if found is not None:
             self.tally.resumed += 1
             return found
-        files.write(0, compute())
+        with self.tally.timing(name):
+            files.write(0, compute())
         self.tally.computed += 1
         return Results(files, 1)[0]
 

@@ -62,9 +62,14 @@ class StageRecord:
         What went in and what came out.
     reused : bool
         True if an earlier result was taken.
+    cpu_seconds : float
+        Of the processor, all threads of this process together, which other programs on a
+        busy machine change little.
     blocks_computed, blocks_resumed : int
         Blocks of work that this run has done, and that it found done by one that was
         interrupted.
+    work : dict of str to float
+        Processor seconds of each work by blocks; of work inside another, both.
     """
 
     name: str
@@ -74,8 +79,10 @@ class StageRecord:
     size_bytes: int
     counts: dict[str, Any] = field(default_factory=dict)
     reused: bool = False
+    cpu_seconds: float = 0.0
     blocks_computed: int = 0
     blocks_resumed: int = 0
+    work: dict[str, float] = field(default_factory=dict)
 
 
 class MemoryWatch:
@@ -187,7 +194,7 @@ class StageFolder:
         described: dict[str, Any],
     ) -> StageRecord:
         """Compute a stage into its unfinished folder, its record last."""
-        started = time.perf_counter()
+        started, spent = time.perf_counter(), time.process_time()
         self.tally = Tally()
         try:
             with MemoryWatch() as watch:
@@ -203,8 +210,10 @@ class StageFolder:
             peak_bytes=watch.peak_bytes,
             size_bytes=folder_bytes(partial, without=BLOCKS),
             counts=counts,
+            cpu_seconds=time.process_time() - spent,
             blocks_computed=self.tally.computed,
             blocks_resumed=self.tally.resumed,
+            work=self.tally.cpu_seconds,
         )
         with replacing(partial / RECORD) as unfinished:
             unfinished.write_text(
@@ -260,7 +269,7 @@ def _matching_record(folder: Path, key: str) -> StageRecord | None:
         return None
     if not isinstance(found, dict) or found.get("key") != key:
         return None
-    kept = {f.name: found.get(f.name, f.default) for f in fields(StageRecord)}
+    kept = {entry.name: found[entry.name] for entry in fields(StageRecord)}
     return StageRecord(**{**kept, "reused": True})
 
 
@@ -292,6 +301,11 @@ def prepare_partial(partial: Path, key: str, *, fresh: bool) -> None:
         # What a kill left of a chunk that was being written.
         for unfinished in (partial / name).rglob("*.partial"):
             unfinished.unlink()
+
+
+def key_of(partial: Path) -> str:
+    """Key of the stage that is being computed into a folder."""
+    return (partial / KEY).read_text()
 
 
 def has_blocks(partial: Path) -> bool:

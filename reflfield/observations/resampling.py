@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeVar
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +28,9 @@ from reflfield.errors import InputError
 from reflfield.sphere.hemisphere import HORIZON_SOFTNESS, HemisphereGrid, softened_cosine
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Ints = NDArray[np.int32]
+Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 Directions = TypeVar("Directions", NDArray[np.float32], NDArray[np.float64])
 
@@ -221,7 +225,7 @@ class RootedSamples:
     Parameters
     ----------
     values : (n, n_views, n_lights, 3) float32
-        Samples over softened cosine, in the domain.
+        Samples over softened cosine, in the domain; zero where they do not count.
     view_taps, light_taps : tuple of ((n, k, 4) int32, (n, k, 4) float32)
         Nodes and weights.
     view_weights, light_weights : (n, k) float32
@@ -273,9 +277,13 @@ def rooted_samples(
     if sides[1] > 1:
         cosine = softened_cosine(light[..., 2]).astype(np.float32)
     safe = np.where(light_seen, cosine, np.float32(1.0))
-    ratio = texels.samples.astype(np.float32) / safe[:, None, :, None]
+    # A third of the samples count at a dome: only these are brought into the domain.
+    t, i, j = np.nonzero(view_seen[:, :, None] & light_seen[:, None] & texels.pairs)
+    values = np.zeros(texels.samples.shape, np.float32)
+    ratio = texels.samples[t, i, j].astype(np.float32) / safe[t, j][:, None]
+    values[t, i, j] = root(ratio, domain)
     return RootedSamples(
-        values=root(ratio, domain),
+        values=values,
         view_taps=direction_taps(view, sides[0]),
         light_taps=direction_taps(light, sides[1]),
         view_weights=view_seen.astype(np.float32),
@@ -332,36 +340,174 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
 
     Notes
     -----
-    Two solves of the size of the number of views and of lights per texel. Pairs that
-    were never photographed are filled from the fit, `FILLING_SWEEPS` times, and count as
+    Two solves per texel, of the size of the number of views and of lights that count. Pairs
+    that were never photographed are filled from the fit, `FILLING_SWEEPS` times, and count as
     observed only as far as photographed ones lie near them.
     """
-    from_views, view_support = _operator(
-        rooted.view_taps, rooted.view_weights, sides[0], smoothness
+    n, n_nodes = len(rooted.values), (sides[0] ** 2, sides[1] ** 2)
+    values = np.zeros((n, *n_nodes, 3), np.float32)
+    supports = (np.zeros((n, n_nodes[0]), np.float32), np.zeros((n, n_nodes[1]), np.float32))
+    _resample_texels(
+        rooted.values,
+        (rooted.view_taps, rooted.light_taps),
+        (rooted.view_weights, rooted.light_weights),
+        (prior_covariance(sides[0], smoothness), prior_covariance(sides[1], smoothness)),
+        (1 if sides[0] == 1 else 4, 1 if sides[1] == 1 else 4),
+        rooted.pairs > 0,
+        0 if rooted.pairs.all() else FILLING_SWEEPS,
+        values,
+        supports,
     )
-    from_lights, light_support = _operator(
-        rooted.light_taps, rooted.light_weights, sides[1], smoothness
-    )
+    for support in supports:
+        np.minimum(support, 1.0, out=support)
+        support[support < LEAST_SUPPORT] = 0.0
     if rooted.pairs.all():
-        nodes = apply_both(from_views, from_lights, rooted.values)
-        return Nodes(nodes, view_support, light_support)
+        return Nodes(values, *supports)
     to_views = interpolation_matrices(rooted.view_taps, sides[0])
     to_lights = interpolation_matrices(rooted.light_taps, sides[1])
-    photographed = (rooted.pairs > 0)[None, :, :, None]
-    values = np.where(photographed, rooted.values, _means(rooted)[:, None, None])
-    for _ in range(FILLING_SWEEPS):
-        nodes = apply_both(from_views, from_lights, values)
-        values = np.where(photographed, values, apply_both(to_views, to_lights, nodes))
-    nodes = apply_both(from_views, from_lights, values)
-    support = _pair_support(rooted, to_views, to_lights)
-    return Nodes(nodes, view_support, light_support, support)
+    return Nodes(values, *supports, _pair_support(rooted, to_views, to_lights))
 
 
-def _means(rooted: RootedSamples) -> Floats:
-    """Weighted mean (n, 3) of each texel's samples: where the filling starts."""
-    weights = rooted.view_weights[:, :, None] * rooted.pairs * rooted.light_weights[:, None]
-    total = np.einsum("tij,tijc->tc", weights, rooted.values)
-    return total / np.maximum(weights.sum(axis=(1, 2)), np.float32(1e-6))[:, None]
+@numba.njit(cache=True, nogil=True)
+def _gather_taps(
+    nodes: Ints, taps: Floats, counted: Indices, n_taps: int, n_nodes: int, support: Floats
+) -> Floats:
+    """Interpolation (k, n_nodes) at the directions that count; adds to the nodes' support."""
+    dense = np.zeros((len(counted), n_nodes), np.float32)
+    for i, direction in enumerate(counted):
+        for tap in range(n_taps):
+            dense[i, nodes[direction, tap]] += taps[direction, tap]
+            support[nodes[direction, tap]] += taps[direction, tap]
+    return dense
+
+
+@numba.njit(cache=True, nogil=True)
+def _spread_over_nodes(
+    nodes: Ints, taps: Floats, half: Doubles, counted: Indices, prior: Doubles, n_taps: int
+) -> tuple[Doubles, Doubles]:
+    """H A P of shape (k, n_nodes), and H A P A^T H + 1; H is the root of the weights."""
+    spread = np.zeros((len(counted), len(prior)))
+    for i, direction in enumerate(counted):
+        for tap in range(n_taps):
+            row = prior[nodes[direction, tap]]
+            factor = half[i] * taps[direction, tap]
+            for node in range(len(row)):
+                spread[i, node] += factor * row[node]
+    system = np.eye(len(counted))
+    for i in range(len(counted)):
+        for j, direction in enumerate(counted):
+            for tap in range(n_taps):
+                factor = half[j] * taps[direction, tap]
+                system[i, j] += factor * spread[i, nodes[direction, tap]]
+    return spread, system
+
+
+@numba.njit(cache=True, nogil=True)
+def _operator(
+    nodes: Ints, taps: Floats, weights: Floats, counted: Indices, prior: Doubles, n_taps: int
+) -> Floats:
+    """Matrix (n_nodes, k) from the samples that count to the nodes.
+
+    A constant may vary 1e5 times as much as a sample: in float32 the solve would lose
+    three of seven digits.
+    """
+    half = np.sqrt(weights[counted].astype(np.float64))
+    spread, system = _spread_over_nodes(nodes, taps, half, counted, prior, n_taps)
+    solved = np.linalg.solve(system, spread)
+    for i in range(len(counted)):
+        solved[i] *= half[i]
+    return np.ascontiguousarray(solved.T).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _both(left: Floats, right: Floats, values: Floats, out: Floats) -> None:
+    """Left @ values @ right^T for each channel: (a, b), (c, d), (b, d, 3) to (a, c, 3)."""
+    a, (c, d) = left.shape[0], right.shape
+    halfway = (left @ values.reshape(-1, 3 * d)).reshape(a, d, 3)
+    folded = np.zeros((a, 3, d), np.float32)
+    for i in range(a):
+        for j in range(d):
+            for channel in range(3):
+                folded[i, channel, j] = halfway[i, j, channel]
+    found = (folded.reshape(3 * a, d) @ right.T).reshape(a, 3, c)
+    for i in range(a):
+        for channel in range(3):
+            for j in range(c):
+                out[i, j, channel] = found[i, channel, j]
+
+
+@numba.njit(cache=True, nogil=True)
+def _weighted_mean(
+    values: Floats,
+    counted: tuple[Indices, Indices],
+    weights: tuple[Floats, Floats],
+    pairs: Bools,
+) -> Floats:
+    """Mean (3,) of one texel's samples: where the filling starts."""
+    total, weight = np.zeros(3), 1e-6
+    for i in counted[0]:
+        for j in counted[1]:
+            if pairs[i, j]:
+                share = weights[0][i] * weights[1][j]
+                weight += share
+                for channel in range(3):
+                    total[channel] += share * values[i, j, channel]
+    return (total / weight).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _resample_texels(
+    values: Floats,
+    taps: tuple[tuple[Ints, Floats], tuple[Ints, Floats]],
+    weights: tuple[Floats, Floats],
+    priors: tuple[Doubles, Doubles],
+    n_taps: tuple[int, int],
+    pairs: Bools,
+    n_sweeps: int,
+    out: Floats,
+    supports: tuple[Floats, Floats],
+) -> None:
+    """Fill nodes (n, n_view_nodes, n_light_nodes, 3) and supports, texel by texel."""
+    for t in range(len(values)):
+        view, light = np.flatnonzero(weights[0][t]), np.flatnonzero(weights[1][t])
+        sizes = (len(priors[0]), len(priors[1]))
+        to_view = _gather_taps(
+            taps[0][0][t], taps[0][1][t], view, n_taps[0], sizes[0], supports[0][t]
+        )
+        to_light = _gather_taps(
+            taps[1][0][t], taps[1][1][t], light, n_taps[1], sizes[1], supports[1][t]
+        )
+        if len(view) == 0 or len(light) == 0:
+            continue
+        of_view = _operator(
+            taps[0][0][t], taps[0][1][t], weights[0][t], view, priors[0], n_taps[0]
+        )
+        of_light = _operator(
+            taps[1][0][t], taps[1][1][t], weights[1][t], light, priors[1], n_taps[1]
+        )
+        mean = _weighted_mean(values[t], (view, light), (weights[0][t], weights[1][t]), pairs)
+        own = np.zeros((len(view), len(light), 3), np.float32)
+        expected = np.zeros_like(own) + mean
+        _take(values[t], (view, light), pairs, expected, own)
+        _both(of_view, of_light, own, out[t])
+        for _ in range(n_sweeps):
+            _both(to_view, to_light, out[t], expected)
+            _take(values[t], (view, light), pairs, expected, own)
+            _both(of_view, of_light, own, out[t])
+
+
+@numba.njit(cache=True, nogil=True)
+def _take(
+    values: Floats,
+    counted: tuple[Indices, Indices],
+    pairs: Bools,
+    expected: Floats,
+    own: Floats,
+) -> None:
+    """Samples that count, and what is expected of pairs that were not photographed."""
+    for i, view in enumerate(counted[0]):
+        for j, light in enumerate(counted[1]):
+            own[i, j] = values[view, light] if pairs[view, light] else expected[i, j]
 
 
 def _pair_support(rooted: RootedSamples, to_views: Floats, to_lights: Floats) -> Floats:
@@ -416,24 +562,3 @@ def interpolation_matrices(taps: tuple[NDArray[np.int32], Floats], side: int) ->
     for tap in range(4 if side > 1 else 1):
         dense[row, nodes[..., tap].ravel()] += weights[..., tap].ravel()
     return dense.reshape(n, k, side * side)
-
-
-def _operator(
-    taps: tuple[NDArray[np.int32], Floats], weights: Floats, side: int, smoothness: float
-) -> tuple[Floats, Floats]:
-    """Matrices (n, n_nodes, k) from samples to nodes, and the nodes' support.
-
-    A constant may vary 1e5 times as much as a sample: in float32 the solve would lose
-    three of seven digits.
-    """
-    interpolation = interpolation_matrices(taps, side)
-    half = np.sqrt(weights)[:, :, None]
-    weighted = (interpolation * half).astype(np.float64)
-    spread = weighted @ prior_covariance(side, smoothness)
-    system = spread @ np.swapaxes(weighted, 1, 2)
-    diagonal = np.arange(weights.shape[1])
-    system[:, diagonal, diagonal] += 1.0
-    operator = np.linalg.solve(system, spread).astype(np.float32)
-    support = np.minimum((interpolation * (weights > 0)[:, :, None]).sum(axis=1), 1.0)
-    support[support < LEAST_SUPPORT] = 0.0
-    return np.swapaxes(operator * half, 1, 2), support.astype(np.float32)

@@ -174,11 +174,23 @@ def checked_read(
 
 
 def opened(location: Location) -> str | FsspecStore:
-    """What zarr opens for a location; local files are always written by rename."""
+    """What zarr opens for a location; local files are always written by rename.
+
+    Raises
+    ------
+    InputError
+        If there is no file system for the URL.
+    """
     text = str(location)
-    if "://" in text and not text.startswith("file://"):
+    if "://" not in text or text.startswith("file://"):
+        return text.removeprefix("file://")
+    try:
         return FsspecStore.from_url(text)
-    return text.removeprefix("file://")
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"{text}: expected a URL that fsspec can open, but {error}; install what it "
+            "names, or use a folder"
+        ) from error
 
 
 def create_samples(

@@ -186,7 +186,8 @@ def inferred(context: Inference, texels: Indices) -> dict[str, Floats]:
     """Coefficients of some texels that did not shape a completion."""
     parts = []
     for some in blocks_of(texels, COLUMNS_AT_ONCE):
-        values, weights = context.texels.columns(some)
+        # Row by row, as the arithmetic goes.
+        values, weights = map(np.ascontiguousarray, context.texels.columns(some))
         found, _ = infer_coefficients(context.completion, values, weights=weights, n_channels=3)
         parts.append(found)
     return {"coefficients": np.concatenate(parts)}

@@ -20,11 +20,13 @@ from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import TexelReader, grid_sides
 from reflfield.observations.store import Location, ObservationStore, Observed
 from reflfield.scheduling import Blocks, Scheduler
-from reflfield.stages import StageFolder
+from reflfield.stages import RESTARTABLE, StageFolder, key_of
 from reflfield.steps.options import PipelineOptions
 
 # Held-out frames are rendered and shown: more than this many say nothing new.
 MOST_HELD_FRAMES = 64
+# In the folder of the observations: the samples, or the name of the place where they are.
+SAMPLES, ELSEWHERE = RESTARTABLE[0], "samples.location"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,21 @@ class Job:
     @property
     def samples_location(self) -> Location:
         """Where the samples of all texels are: in their stage's folder, or in a store."""
-        return self.stages.root / "observations" / "samples"
+        folder = self.stages.root / "observations"
+        if (folder / ELSEWHERE).is_file():
+            return (folder / ELSEWHERE).read_text()
+        return folder / SAMPLES
+
+    def new_samples_location(self, folder: Path) -> Location:
+        """Where the stage that is computed into `folder` puts the samples.
+
+        In a store, in a place of its own for each key, which is noted in the folder.
+        """
+        if self.resources.store is None:
+            return folder / SAMPLES
+        location = f"{self.resources.store.rstrip('/')}/samples-{key_of(folder)[:16]}"
+        (folder / ELSEWHERE).write_text(location)
+        return location
 
     @cached_property
     def held_views(self) -> NDArray[np.intp]:

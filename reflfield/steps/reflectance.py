@@ -61,9 +61,7 @@ REFINEMENT = RefinementOptions(side=25, rounds=4, texels_per_cluster=8192)
 
 def write_observations(job: Job, folder: Path) -> dict[str, Any]:
     """Apparent BRDF samples of all texels, on disk."""
-    location = job.samples_location
-    if isinstance(location, Path):
-        location = folder / location.name
+    location = job.new_samples_location(folder)
     projection = Projection(
         job.training, job.texels.position, job.view_seen, location, job.resources.block_bytes
     )

@@ -97,6 +97,11 @@ class TestObjectStorage:
         stored = ObservationStore(url, all_observed(300, 9, 5))
         assert np.array_equal(stored.read(np.array([299, 4])), values[[299, 4]])
 
+    @pytest.mark.parametrize("url", ["nosuch://a/b", "gdrive://a/b"])
+    def test_without_a_file_system_is_named(self, url):
+        with pytest.raises(InputError, match=f"{url}: expected a URL that fsspec can open"):
+            create_samples(url, 3, 2, 2)
+
     def test_a_local_url_is_a_folder(self, tmp_path):
         create_samples(f"file://{tmp_path}/s", 3, 2, 2)[:] = 1
         assert (ObservationStore(tmp_path / "s", all_observed(3, 2, 2)).read([0]) == 1).all()

@@ -88,3 +88,29 @@ def test_effects_on_the_pipeline(subprocess_run, tiny_options, tmp_path):
     table = (tmp_path / "out" / "effects.md").read_text()
     assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == ["none", "bayer"]
     assert (tmp_path / "out" / "effects.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_paper_scale(subprocess_run, tiny_options, tmp_path):
+    small = (
+        "--rig",
+        "fibonacci",
+        "--directions",
+        12,
+        "--pixels",
+        24,
+        "--texels",
+        64,
+        "--points",
+        0,
+    )
+    words = (EXAMPLES / "paper_scale.py", tmp_path, *small, "--config", tiny_options)
+    done = subprocess_run(*words, "--kill", 2)
+    assert done.status == 0, done.err
+    lines = done.out.splitlines()
+    stages = [line.split()[0] for line in lines if line.split()[-1].startswith("0.")]
+    assert {"simulation", "hull", "observations", "compression", "report"} <= set(stages)
+    assert " 0 differ" in lines[-1]
+    done = subprocess_run(*words, "--per-texel", 64, "--training", 100)
+    assert done.status == 0, done.err
+    assert "largest deviation" in done.out

@@ -1,55 +1,108 @@
 """Killed in the middle of a stage and run again, a run ends with the same bytes."""
 
 import hashlib
+import json
 import os
 import signal
 
 import pytest
 
-# Runs the command; the process kills itself, as SIGKILL does, at a step of the progress
-# that is reported while the stage's partial folder exists.
-KILLED_IN = """
+from reflfield.scheduling import BlockFiles
+
+# Runs the command; the process is killed at the step of its progress that is named.
+KILLED_AT = """
 import os, signal, sys
-from pathlib import Path
 import reflfield.cli as cli
 
-partial, step = Path(sys.argv.pop(1)), int(sys.argv.pop(1))
+last = int(sys.argv.pop(1))
 
 class Killer:
     def __init__(self, write):
         self.steps = 0
     def __call__(self, description, done, total):
-        self.steps += partial.is_dir()
-        if self.steps == step:
+        self.steps += 1
+        if self.steps == last:
             os.kill(os.getpid(), signal.SIGKILL)
 
 cli.ProgressLines = Killer
 cli.main()
 """
+# What only the basis needs is not looked at again once that is done.
+FOR_THE_BASIS = "resampling for the basis"
 
 
 def digest(path):
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def whole_blocks(partial):
+    """Verified results of blocks in an unfinished stage's folder."""
+    folders = [f for f in (partial / "blocks").glob("*") if list(f.glob("*.block"))]
+    return {
+        (folder.name, number)
+        for folder in folders
+        for number in range(100)
+        if BlockFiles(folder).read(number) is not None
+    }
+
+
+def records(out):
+    """What the finished stages say of themselves."""
+    paths = out.glob("stages/*/stage.json")
+    return {path.parent.name: json.loads(path.read_text()) for path in paths}
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs a system with SIGKILL")
-def test_killed_in_three_stages_and_run_again(
-    finished, tiny_capture, tiny_options, subprocess_run, run_tiny, tmp_path
+@pytest.mark.parametrize("n_kills", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_killed_at_random_moments_and_run_again(
+    finished, tiny_capture, tiny_options, subprocess_run, run_tiny, tmp_path, rng, n_kills
 ):
     out = tmp_path / "run"
-    words = ("run", tiny_capture, "-o", out, "--config", tiny_options)
+    words = ("run", tiny_capture, "-o", out, "--config", tiny_options, "--workers", 2)
     held = ("--hold-out", "views=1,lights=1")
-    for stage, step in (("hull", 4), ("observations", 2), ("compression", 8)):
-        partial = out / "stages" / f"{stage}.partial"
-        killed = subprocess_run("-c", KILLED_IN, partial, step, *words, *held)
-        assert killed.status == -signal.SIGKILL
-        assert partial.is_dir()
-        assert not partial.with_name(stage).exists()
+    left: dict[str, set] = {}
+    for _ in range(n_kills):
+        before = set(records(out)) if out.exists() else set()
+        killed = subprocess_run("-c", KILLED_AT, int(rng.integers(5, 30)), *words, *held)
+        assert killed.status == -signal.SIGKILL, killed.err
         assert not (out / "field.rfld").exists()
+        for partial in out.glob("stages/*.partial"):
+            # Blocks that were done are done for ever, as long as the stage lasts.
+            assert left.get(partial.stem, set()) <= whole_blocks(partial)
+            left[partial.stem] = whole_blocks(partial)
+        assert before <= set(records(out))
     assert run_tiny(out).status == 0
     assert [p for p in out.rglob("*") if "partial" in p.name] == []
     for name in ("field.rfld", "hull.ply", "atlas.glb", "normals.exr", "metrics.json"):
         assert digest(out / name) == digest(finished.folder / name), name
+    whole = records(finished.folder)
+    for stage, record in records(out).items():
+        # What a kill leaves is taken up; the rest is computed once.
+        kept = left.get(stage, set())
+        if ("basis", 0) in kept:
+            kept = {block for block in kept if block[0] != FOR_THE_BASIS}
+        assert record["blocks_resumed"] == len(kept), stage
+        together = record["blocks_computed"] + record["blocks_resumed"]
+        assert together <= whole[stage]["blocks_computed"], stage
+    assert sum(map(len, left.values())) > 0
+
+
+def test_a_cluster_makes_the_same_bytes(finished, run_tiny, cluster, tmp_path):
+    outcome = run_tiny(tmp_path / "run", "--until", "compression", "--scheduler", cluster)
+    assert outcome.status == 0, outcome.err
+    for name in ("field.rfld", "stages/completion/completion.npz", "hull.ply"):
+        assert digest(tmp_path / "run" / name) == digest(finished.folder / name), name
+
+
+@pytest.mark.parametrize("kind", ["memory://test_resume", "folder"])
+def test_samples_in_a_store_elsewhere_make_the_same_bytes(finished, run_copy, run_tiny, kind):
+    store = kind if "://" in kind else run_copy.parent / kind
+    words = ("--from", "observations", "--until", "completion", "--store", store)
+    outcome = run_tiny(run_copy, *words)
+    assert outcome.status == 0, outcome.err
+    assert not (run_copy / "stages" / "observations" / "samples").exists()
+    made = run_copy / "stages" / "completion" / "completion.npz"
+    assert digest(made) == digest(finished.folder / "stages" / "completion" / made.name)
 
 
 def test_killed_while_an_earlier_result_is_replaced(run_copy, run_tiny, finished):

@@ -1,0 +1,230 @@
+"""The paper's job, 151 x 151 photographs and 256 x 256 texels, on this machine.
+
+    python examples/paper_scale.py OUT             # simulate, process, compress, compare
+    python examples/paper_scale.py OUT --kill 5    # killed five times: the same bytes?
+    python examples/paper_scale.py OUT --per-texel 64 128 256
+
+A vase of glaze and paint with brushed bands of gold stands in a dome. The first form prints
+seconds and peak memory of every stage; the second processes once more, kills the process
+(SIGKILL) at random moments, runs it again, and compares; the third prints what one texel
+costs at several sizes of the texture. What is done already is not done again, so the forms
+may follow each other. The bases are shaped by 2048 texels; all are completed and fitted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+SCENE = """
+effects = ["antialiasing", "near_lights", "shadows"]
+[object]
+preset = "vase"
+[material]
+preset = "painted_vase"
+[cameras]
+preset = "{rig}"
+{directions}
+target = [0.0, 0.0, 0.1]
+distance = 1.0
+extent = 0.25
+width = {pixels}
+height = {pixels}
+[lights]
+preset = "{rig}"
+{directions}
+target = [0.0, 0.0, 0.1]
+distance = 1.0
+[heldout]
+frames = 4
+[truth]
+per_view = false
+points = {points}
+"""
+# Works of the stages that go texel by texel; of the others the number of texels is no matter.
+BY_TEXELS = {
+    "completion": ("completing all texels",),
+    "alignment": ("frames on the samples",),
+    "compression": ("completing all texels",),
+}
+
+
+def simulate(arguments: argparse.Namespace) -> Path:
+    """Photograph the vase, by the installed command; the capture."""
+    capture = arguments.out / "capture"
+    if (capture / "capture.json").is_file():
+        return capture
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    scene = arguments.out / "paper_scale.toml"
+    scene.write_text(
+        SCENE.format(
+            rig=arguments.rig,
+            directions=f"n = {arguments.directions}" if arguments.directions else "",
+            pixels=arguments.pixels,
+            points=arguments.points,
+        )
+    )
+    started = time.perf_counter()
+    command = Path(sys.executable).with_name("capture-sim")
+    call(command, "render", scene, "-o", capture, "--workers", arguments.workers)
+    # Of the largest process so far; it is the first.
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    say("simulation", time.perf_counter() - started, None, peak)
+    return capture
+
+
+def call(*words: object) -> None:
+    """Run a command, its progress going to standard error."""
+    subprocess.run(list(map(str, words)), check=True, stdout=sys.stderr)
+
+
+def process_words(
+    arguments: argparse.Namespace, capture: Path, out: Path, texels: int, training: int
+) -> list[object]:
+    """The command that processes the capture."""
+    options = {
+        "atlas.resolution": texels,
+        "completion.training_texels": training,
+        "compression.training_texels": training,
+    }
+    settings = [word for item in options.items() for word in ("--set", "{}={}".format(*item))]
+    config = ("--config", arguments.config) if arguments.config else ()
+    return [
+        *(sys.executable, "-m", "reflfield.cli", "run", capture, "-o", out),
+        *("--workers", arguments.workers, *config, *settings),
+        *("--max-memory", arguments.max_memory, "--hold-out", "views=2,lights=2"),
+    ]
+
+
+def say(name: str, seconds: float, cpu: float | None, peak: float) -> None:
+    """One line of the table."""
+    processor = "" if cpu is None else f"{cpu:9.1f}"
+    print(f"{name:<20}{seconds:9.1f}{processor:>9}{peak / 2**30:8.2f}", flush=True)
+
+
+def processed(arguments: argparse.Namespace, capture: Path) -> None:
+    """Process the capture, and print what each stage took."""
+    out = arguments.out / "run"
+    call(*process_words(arguments, capture, out, arguments.texels, 2048))
+    timings = json.loads((out / "timings.json").read_text())
+    for stage in timings["stages"]:
+        say(stage["name"], stage["seconds"], stage["cpu_seconds"], stage["peak_bytes"])
+    cpu = sum(stage["cpu_seconds"] for stage in timings["stages"])
+    say("after simulation", timings["seconds"], cpu, timings["peak_bytes"])
+    print(f"ceiling of memory {timings['max_memory'] / 2**30:.2f} GB")
+    metrics = json.loads((out / "metrics.json").read_text())
+    print(f"held out: PSNR {metrics['mean']['psnr_ldr']:.2f} dB")
+    print(f"field: {(out / 'field.rfld').stat().st_size / 1e6:.2f} MB")
+
+
+def digests(out: Path) -> dict[str, str]:
+    """SHA-256 of the field and of all that the stages made, times and memory left out."""
+    files = [path for path in sorted((out / "stages").rglob("*")) if path.is_file()]
+    wanted = [
+        path
+        for path in (out / "field.rfld", *files)
+        if path.name not in ("stage.json", ".lock") and "report" not in path.parts
+    ]
+    found = {}
+    for path in wanted:
+        with path.open("rb") as file:
+            found[str(path.relative_to(out))] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
+def kill_and_resume(arguments: argparse.Namespace, capture: Path) -> None:
+    """Process again, killed at random moments, and compare with the run that was not."""
+    whole, out = arguments.out / "run", arguments.out / "killed"
+    shutil.rmtree(out, ignore_errors=True)
+    lasting = json.loads((whole / "timings.json").read_text())["seconds"]
+    rng = random.Random(arguments.seed)
+    words = process_words(arguments, capture, out, arguments.texels, 2048)
+    command = list(map(str, words))
+    for kill in range(arguments.kill):
+        running = subprocess.Popen(command, stdout=sys.stderr)
+        try:
+            running.wait(rng.uniform(0.2, 1.8) * lasting / (arguments.kill + 1))
+        except subprocess.TimeoutExpired:
+            running.kill()
+            running.wait()
+            at = [path.stem for path in out.glob("stages/*.partial")]
+            print(f"kill {kill + 1}: in {', '.join(at) or 'no stage'}", flush=True)
+    subprocess.run(command, check=True, stdout=sys.stderr)
+    for record in json.loads((out / "timings.json").read_text())["stages"]:
+        if record["blocks_resumed"]:
+            print(
+                f"{record['name']}: {record['blocks_resumed']} blocks taken up, "
+                f"{record['blocks_computed']} computed after the last kill"
+            )
+    expected, found = digests(whole), digests(out)
+    different = {name for name in expected | found if expected.get(name) != found.get(name)}
+    print(f"{len(expected)} files compared, {len(different)} differ: {sorted(different)[:9]}")
+    if different:
+        sys.exit(1)
+
+
+def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
+    """Print the processor time of one texel at several sizes of the texture."""
+    print("texture       texels   ms of the processor per texel: " + ", ".join(BY_TEXELS))
+    totals = []
+    for side in arguments.per_texel:
+        out = arguments.out / f"texels_{side}"
+        words = process_words(arguments, capture, out, side, arguments.training)
+        call(*words, "--until", "compression")
+        stages = {
+            stage["name"]: stage
+            for stage in json.loads((out / "timings.json").read_text())["stages"]
+        }
+        completion = stages["completion"]["counts"]
+        seen = completion["texels completed"]
+        others = seen - completion["texels that shape the basis"]
+        parts = []
+        for name, works in BY_TEXELS.items():
+            n = seen if name == "alignment" else others
+            seconds = sum(stages[name]["work"].get(work, 0.0) for work in works)
+            parts.append(1e3 * seconds / max(n, 1))
+        totals.append(sum(parts))
+        shown = "".join(f"{part:9.2f}" for part in (*parts, totals[-1]))
+        print(f"{side:4d} x {side:4d} {seen:9d} {shown}", flush=True)
+    mean = sum(totals) / len(totals)
+    print(f"largest deviation from the mean: {max(abs(t / mean - 1) for t in totals):.1%}")
+
+
+def main() -> None:
+    """Parse, simulate, and what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--rig", default="bonn151", help="cameras and lights; also ubo81")
+    parser.add_argument("--directions", type=int, help="of the rigs that have a number")
+    parser.add_argument("--pixels", type=int, default=256, help="side of the photographs")
+    parser.add_argument("--texels", type=int, default=256, help="side of the texture")
+    parser.add_argument("--points", type=int, default=100, help="true ABRDFs to compare with")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--max-memory", default="6GB")
+    parser.add_argument("--config", type=Path, help="further options in TOML")
+    parser.add_argument("--kill", type=int, metavar="N", help="kill N times and compare")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--per-texel", type=int, nargs="+", metavar="SIDE")
+    parser.add_argument("--training", type=int, default=512, help="texels, with --per-texel")
+    arguments = parser.parse_args()
+
+    capture = simulate(arguments)
+    if arguments.per_texel:
+        per_texel(arguments, capture)
+        return
+    print(f"{'stage':<20}{'seconds':>9}{'cpu':>9}{'GB':>8}")
+    processed(arguments, capture)
+    if arguments.kill:
+        kill_and_resume(arguments, capture)
+
+
+if __name__ == "__main__":
+    main()
