@@ -90,7 +90,7 @@ def contributions(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> list[Co
         In the order of the effects. Those that are on are left out for comparison, those
         that are off but described are added. Missing photographs have none.
     """
-    arriving(scene, tracer, pairs[:1])  # what is compiled or traced once is no part of it
+    arriving(scene, tracer, pairs)  # what is compiled or found once for all is no part of it
     everything, seconds = arriving(scene, tracer, pairs)
     found = []
     for effect in EFFECTS:

@@ -18,6 +18,7 @@ from capture_sim.effects import (
     Rig,
     defocus,
     environment,
+    in_turn,
     light_extent,
     simulated,
     vignetting,
@@ -128,7 +129,7 @@ def photographs(
     for light, radiance in _lit_by_lamps(scene, tracer, view, lights, traced):
         frame = Frame(view.camera, index, light, depth=depth)
         arriving = radiance if room is None else radiance + room
-        yield frame, _through_lens(scene, arriving, frame)
+        yield frame, in_turn(OPTICS_EFFECTS, arriving, scene, frame)
 
 
 def _lit_by_lamps(
@@ -169,14 +170,6 @@ def _lit_together(
     for _, radiance in render_view(replace(scene, lights=lights), tracer, view):
         total += radiance
     return total
-
-
-def _through_lens(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
-    for effect in OPTICS_EFFECTS:
-        if simulated(scene, effect):
-            with scene.costs.measure(effect.NAME):
-                radiance = effect.apply(radiance, scene, frame)
-    return radiance
 
 
 def mean_depth(view: ViewSamples) -> Float32:

@@ -301,6 +301,24 @@ def _node(first: Any, k: Any, i: Any, j: Any) -> Any:
 
 
 @_compiled
+def nodes_about(barycentric: _Values, k: Any, first: Any) -> Any:
+    """Indices of the three nodes about a point of a triangle, and their linear weights.
+
+    `k` is the triangle's number of steps, `first` the index of its first node.
+    """
+    x = min(max(barycentric[1], 0.0), 1.0) * k
+    y = min(max(barycentric[2], 0.0), 1.0) * k
+    i = min(int(x), k - 1)
+    j = min(int(y), k - 1 - i)
+    x, y = x - i, y - j
+    a, b = _node(first, k, i + 1, j), _node(first, k, i, j + 1)
+    # The upper triangle of the cell, unless the cell is the last of its row.
+    if x + y > 1.0 and i + j < k - 1:
+        return (a, b, _node(first, k, i + 1, j + 1)), (1.0 - y, 1.0 - x, x + y - 1.0)
+    return (a, b, _node(first, k, i, j)), (x, y, 1.0 - x - y)
+
+
+@_compiled
 def _look_up(
     face: _Values,
     barycentric: _Values,
@@ -312,16 +330,7 @@ def _look_up(
 ) -> None:
     """Intersection and union of the bits of the three nodes about each point."""
     for n in range(len(face)):
-        k = per_side[face[n]]
-        x = min(max(barycentric[n, 1], 0.0), 1.0) * k
-        y = min(max(barycentric[n, 2], 0.0), 1.0) * k
-        i = min(int(x), k - 1)
-        j = min(int(y), k - 1 - i)
-        start = first[face[n]]
-        a, b = _node(start, k, i + 1, j), _node(start, k, i, j + 1)
-        # The upper triangle of the cell, unless the cell is the last of its row.
-        upper = (x - i) + (y - j) > 1.0 and i + j < k - 1
-        c = _node(start, k, i + 1, j + 1) if upper else _node(start, k, i, j)
+        (a, b, c), _ = nodes_about(barycentric[n], per_side[face[n]], first[face[n]])
         for w in range(bits.shape[1]):
             all_see[n, w] = bits[a, w] & bits[b, w] & bits[c, w]
             any_sees[n, w] = bits[a, w] | bits[b, w] | bits[c, w]

@@ -101,6 +101,11 @@ class Workload:
         """One for each pair of view and light."""
         return self.n_views * self.n_lights
 
+    @property
+    def n_values(self) -> int:
+        """Channels of pixels of all photographs."""
+        return 3 * self.n_pixels * self.n_lights
+
 
 @dataclass(frozen=True)
 class Cost:
@@ -192,6 +197,24 @@ def effect_rng(scene: Scene, effect: str, *indices: int) -> np.random.Generator:
     return np.random.default_rng((scene.seed, *indices, zlib.crc32(effect.encode())))
 
 
+def normal_errors(scene: Scene, effect: str, *shape: int) -> NDArray[np.float64]:
+    """Standard normal numbers from which an effect of the rig draws its errors.
+
+    Parameters
+    ----------
+    scene : Scene
+        Gives the seed: the errors are known before anything is rendered.
+    effect : str
+        Its name.
+    *shape : int
+
+    Returns
+    -------
+    ndarray of float64, of that shape
+    """
+    return effect_rng(scene, effect).standard_normal(shape)
+
+
 class Effect(Protocol):
     """The part of an effect's module that all stages share."""
 
@@ -252,3 +275,36 @@ def simulated(scene: Scene, effect: Effect) -> bool:
     if choice.simulate == "auto":
         return effect.needed(scene).bound > threshold(scene, effect.STAGE)
     return effect.NAME in choice.simulate
+
+
+class ImageEffect(Effect, Protocol):
+    """An effect on whole photographs: of the lens or of the sensor's pixels."""
+
+    def apply(
+        self, values: NDArray[np.float32], scene: Scene, frame: Frame
+    ) -> NDArray[np.float32]:
+        """Change a photograph."""
+
+
+def in_turn(
+    effects: tuple[ImageEffect, ...], values: NDArray[np.float32], scene: Scene, frame: Frame
+) -> NDArray[np.float32]:
+    """Apply those effects on a photograph that are on, one after the other.
+
+    Parameters
+    ----------
+    effects : tuple of modules
+    values : (h, w, 3) or (h, w) float32
+    scene : Scene
+        Decides, and keeps the time that each takes.
+    frame : Frame
+
+    Returns
+    -------
+    (h, w, 3) or (h, w) float32
+    """
+    for effect in effects:
+        if simulated(scene, effect):
+            with scene.costs.measure(effect.NAME):
+                values = effect.apply(values, scene, frame)
+    return values

@@ -62,7 +62,7 @@ def needed(scene: Scene) -> Decision:
 def cost(scene: Scene, work: Workload) -> Cost:
     """One sum for each channel of each pixel."""
     del scene
-    return Cost(operations=3 * work.n_pixels * work.n_lights)
+    return Cost(operations=work.n_values)
 
 
 def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:

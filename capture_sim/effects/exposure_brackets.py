@@ -56,8 +56,7 @@ def needed(scene: Scene) -> Decision:
 
 def cost(scene: Scene, work: Workload) -> Cost:
     """One encoding for each channel of each pixel and exposure."""
-    per_light = 3 * work.n_pixels * len(scene.effects.get(Options).seconds)
-    return Cost(operations=per_light * work.n_lights)
+    return Cost(operations=work.n_values * len(scene.effects.get(Options).seconds))
 
 
 def apply(exposed: NDArray[np.float32]) -> NDArray[np.uint8]:

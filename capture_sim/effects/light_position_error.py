@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, effect_rng
+from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, normal_errors
 from capture_sim.effects.bounds import (
     light_distances,
     pixels_per_metre,
@@ -67,14 +67,8 @@ def needed(scene: Scene) -> Decision:
     return Decision(f"lights turn by up to {np.degrees(turn):.2g} degrees", change)
 
 
-def _errors(scene: Scene, options: Options) -> Array:
-    """Standard normal numbers, (n_lights, 3)."""
-    del options
-    return effect_rng(scene, NAME).standard_normal((len(scene.lights), 3))
-
-
 def _turns(scene: Scene, options: Options) -> Array:
-    size = np.linalg.norm(_errors(scene, options), axis=1)
+    size = np.linalg.norm(normal_errors(scene, NAME, len(scene.lights), 3), axis=1)
     distance = light_distances(scene)
     near = options.position * size / np.where(np.isfinite(distance), distance, 1.0)
     return np.where(np.isfinite(distance), near, np.radians(options.angle_deg) * size)
@@ -100,7 +94,8 @@ def apply(rig: Rig, scene: Scene) -> Rig:
     Rig
     """
     options = scene.effects.get(Options)
-    moved = zip(rig.lights, _errors(scene, options), strict=True)
+    errors = normal_errors(scene, NAME, len(scene.lights), 3)
+    moved = zip(rig.lights, errors, strict=True)
     return replace(rig, lights=tuple(_moved(light, error, options) for light, error in moved))
 
 

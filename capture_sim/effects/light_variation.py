@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, effect_rng
+from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, normal_errors
 from capture_sim.model import Scene, Table
 from capture_sim.tables import bounded
 
@@ -57,7 +57,7 @@ def needed(scene: Scene) -> Decision:
 
 def _factors(scene: Scene, options: Options) -> Array:
     """What each channel of each light is multiplied by, (n_lights, 3); log-normal."""
-    numbers = effect_rng(scene, NAME).standard_normal((len(scene.lights), 4))
+    numbers = normal_errors(scene, NAME, len(scene.lights), 4)
     spread = options.intensity * numbers[:, :1] + options.colour * numbers[:, 1:]
     return np.asarray(np.exp(spread))
 

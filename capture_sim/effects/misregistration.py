@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, effect_rng
+from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, normal_errors
 from capture_sim.effects.bounds import shift_bound
 from capture_sim.model import Scene
 from capture_sim.tables import bounded
@@ -51,8 +51,7 @@ def needed(scene: Scene) -> Decision:
 
 
 def _shifts(scene: Scene, options: Options) -> NDArray[np.float64]:
-    numbers = effect_rng(scene, NAME).standard_normal((len(scene.cameras), 2))
-    return options.pixels * numbers
+    return options.pixels * normal_errors(scene, NAME, len(scene.cameras), 2)
 
 
 def cost(scene: Scene, work: Workload) -> Cost:

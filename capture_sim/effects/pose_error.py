@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, effect_rng
+from capture_sim.effects import Cost, Decision, Rig, Stage, Workload, normal_errors
 from capture_sim.effects.bounds import camera_distances, pixels_per_metre, shift_bound
 from capture_sim.model import Scene, Table
 from capture_sim.tables import bounded
@@ -64,7 +64,7 @@ def needed(scene: Scene) -> Decision:
 
 def _errors(scene: Scene, options: Options) -> tuple[Array, Array]:
     """Rotation vectors (radians) and translations (metres), both (n_views, 3)."""
-    numbers = effect_rng(scene, NAME).standard_normal((2, len(scene.cameras), 3))
+    numbers = normal_errors(scene, NAME, 2, len(scene.cameras), 3)
     return np.radians(options.rotation_deg) * numbers[0], options.translation * numbers[1]
 
 

@@ -9,6 +9,7 @@ from capture_sim.effects import (
     Frame,
     bayer,
     black_level,
+    in_turn,
     quantisation,
     saturation,
     sensor_noise,
@@ -41,20 +42,12 @@ def exposed(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
     """
     values = radiance if frame.seconds == 1.0 else radiance * np.float32(frame.seconds)
     if not simulated(scene, bayer):
-        return _recorded(scene, values, frame)
+        return in_turn(PIXEL_EFFECTS, values, scene, frame)
     with scene.costs.measure(bayer.NAME):
         seen = bayer.mosaic(values)
-    seen = _recorded(scene, seen, frame)
+    seen = in_turn(PIXEL_EFFECTS, seen, scene, frame)
     with scene.costs.measure(bayer.NAME):
         return bayer.apply(seen, scene)
-
-
-def _recorded(scene: Scene, values: Float32, frame: Frame) -> Float32:
-    for effect in PIXEL_EFFECTS:
-        if simulated(scene, effect):
-            with scene.costs.measure(effect.NAME):
-                values = effect.apply(values, scene, frame)
-    return values
 
 
 def dark_noise(scene: Scene) -> float:

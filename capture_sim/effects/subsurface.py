@@ -45,7 +45,7 @@ from capture_sim.rays import RayTracer
 from capture_sim.shading import BYTES_PER_PAIR, direct_light
 from capture_sim.surface import SurfacePoints, surface_points
 from capture_sim.tables import bounded
-from capture_sim.visibility import Nodes, TracedLights
+from capture_sim.visibility import Nodes, TracedLights, nodes_about
 
 NAME = "subsurface"
 STAGE = Stage.TRANSPORT
@@ -369,26 +369,11 @@ def _interpolate(
 ) -> None:
     """Linear interpolation of node values (n_nodes, 3, n_lights) in the small triangles."""
     for n in range(len(face)):
-        k = per_side[face[n]]
-        x = min(max(barycentric[n, 1], 0.0), 1.0) * k
-        y = min(max(barycentric[n, 2], 0.0), 1.0) * k
-        i = min(int(x), k - 1)
-        j = min(int(y), k - 1 - i)
-        tx, ty = x - i, y - j
-        start = first[face[n]]
-        right = start + (i + 1) * (k + 1) - (i + 1) * i // 2 + j
-        above = start + i * (k + 1) - i * (i - 1) // 2 + j + 1
-        if tx + ty > 1.0 and i + j < k - 1:
-            # The small triangle of the three far corners, seen from its own corner.
-            third, w3 = right + 1, tx + ty - 1.0
-            w1, w2 = 1.0 - ty, 1.0 - tx
-        else:
-            third, w3 = above - 1, 1.0 - tx - ty
-            w1, w2 = tx, ty
+        nodes, weights = nodes_about(barycentric[n], per_side[face[n]], first[face[n]])
         for c in range(values.shape[1]):
             for light in range(values.shape[2]):
                 result[n, c, light] += (
-                    w1 * values[right, c, light]
-                    + w2 * values[above, c, light]
-                    + w3 * values[third, c, light]
+                    weights[0] * values[nodes[0], c, light]
+                    + weights[1] * values[nodes[1], c, light]
+                    + weights[2] * values[nodes[2], c, light]
                 )

@@ -77,7 +77,7 @@ def _loss(scene: Scene, camera: Table, distance: float, options: Options) -> flo
 def cost(scene: Scene, work: Workload) -> Cost:
     """One product for each channel of each pixel."""
     del scene
-    return Cost(operations=3 * work.n_pixels * work.n_lights)
+    return Cost(operations=work.n_values)
 
 
 def gain(camera: Table, options: Options) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from capture_sim.effects.registry import EFFECTS, decided
 from capture_sim.rays import RayTracer
 from capture_sim.scene import load_scene
 
-PRESETS = ("vase", "relief", "spot", "two_materials", "bowl")
+PRESETS = ("vase", "relief", "spot", "two_materials", "translucent", "bowl")
 SIDE = 16  # pixels
 # Effects that have no picture of their own to compare.
 NO_PICTURE = {"dropped_photographs"}
