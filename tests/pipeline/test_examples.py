@@ -86,7 +86,8 @@ def test_effects_on_the_pipeline(subprocess_run, tiny_options, tmp_path):
     )
     assert done.status == 0, done.err
     table = (tmp_path / "out" / "effects.md").read_text()
-    assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == ["none", "bayer"]
+    names = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
+    assert names == ["none", "harmless_1", "harmless_2", "harmless_3", "bayer"]
     assert (tmp_path / "out" / "effects.png").stat().st_size > 10_000
 
 
