@@ -241,8 +241,8 @@ class Resources:
 
     @property
     def block_bytes(self) -> int:
-        """Working memory for one block of texels."""
-        return min(self.max_memory // 16, 256 << 20)
+        """Working memory for one block of texels; each thread has one."""
+        return min(self.max_memory // (8 * self.workers), 256 << 20)
 
 
 def gigabytes(size: float) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from reflfield.config import gigabytes
+from reflfield.config import Resources, gigabytes
 from reflfield.errors import InputError
 from reflfield.observations.store import SAMPLE_BYTES, chunk_shape
+from reflfield.steps.columns import COLUMNS_AT_ONCE
 from reflfield.steps.job import Job
 
 # Libraries, compiled kernels and the code itself, measured.
@@ -13,6 +14,8 @@ BASE_BYTES = 512 << 20
 PHOTOGRAPH_COPIES = 3
 # Position, frames, area, quaternions: what is kept of a texel besides the arrays below.
 TEXEL_BYTES = 256
+# Columns of a block while they are inferred: resampled, by rows, clean, residual, weighted.
+COLUMN_COPIES = 6
 # A writer's samples, while they are cut into chunks and encoded.
 WRITER_COPIES = 2
 # Largest share of a texture that charts cover.
@@ -23,14 +26,17 @@ def least_memory(job: Job) -> int:
     """Bytes that the run holds at the same time however small its blocks are.
 
     Silhouettes of all views and one photograph, or what is kept of every texel with the
-    samples of one view under all lights, whichever is more; and one block.
+    samples of one view under all lights, whichever is more; and one block of each thread, or
+    the columns of one, whichever is more.
     """
     training = job.training
     pixels = [camera.width * camera.height for camera in training.cameras]
     views = 5 * sum(pixels) + 12 * PHOTOGRAPH_COPIES * max(pixels)
     rank = max(job.options.completion.rank, job.options.compression.rank)
     each = TEXEL_BYTES + training.n_views + 7 * training.n_lights + 12 * rank
-    return BASE_BYTES + max(views, most_texels(job) * each) + job.resources.block_bytes
+    blocks = job.resources.workers * job.resources.block_bytes
+    columns = columns_bytes(job.sides[0] ** 2 * job.sides[1] ** 2)
+    return BASE_BYTES + max(views, most_texels(job) * each) + max(blocks, columns)
 
 
 def most_texels(job: Job) -> int:
@@ -58,6 +64,16 @@ def check_memory(job: Job) -> None:
             f"{most_texels(job)} texels, received {gigabytes(given)}; raise it, or lower "
             "texture.largest"
         )
+
+
+def columns_bytes(n_pairs: int) -> int:
+    """Memory of one block of columns while their coefficients are inferred."""
+    return COLUMN_COPIES * COLUMNS_AT_ONCE * 12 * n_pairs
+
+
+def columns_at_once(resources: Resources, n_pairs: int) -> int:
+    """Threads that may each infer coefficients of a block of columns at a time."""
+    return int(max(1, (resources.max_memory - BASE_BYTES) // (2 * columns_bytes(n_pairs))))
 
 
 def writers_at_once(job: Job) -> int:

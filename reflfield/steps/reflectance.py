@@ -47,7 +47,7 @@ from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain, versions
 from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
 from reflfield.steps.job import Job
-from reflfield.steps.memory import writers_at_once
+from reflfield.steps.memory import columns_at_once, writers_at_once
 from reflfield.steps.options import AlignmentOptions
 
 Floats = NDArray[np.float32]
@@ -146,6 +146,7 @@ def completed(
             inferred,
             Inference(found, context),
             reader.blocks_of(others),
+            at_once=columns_at_once(resources, reader.n_pairs),
         )
         coefficients[others] = parts.joined("coefficients")
     return found, coefficients
