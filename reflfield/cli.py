@@ -174,6 +174,8 @@ def run(
     options = pipeline_options(config, set_ or [])
     resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler, store)
     held = parse_hold_out(hold_out)
+    if scheduler is not None:  # whose workers run in folders of their own
+        capture, out = capture.resolve(), out.resolve()
     opened = open_capture(capture, format)
     with showing_progress(GOES_ON):
         job = run_pipeline(

@@ -220,7 +220,8 @@ class Resources:
     max_memory : int
         Bytes of resident memory that the blocks are sized for.
     scheduler : str, optional
-        Address of a `dask.distributed` scheduler, whose workers compute the blocks.
+        Address of a `dask.distributed` scheduler, whose workers compute the blocks. They
+        open the capture and the store by the names that this process has for them.
     store : str, optional
         Folder, or URL for fsspec, that holds the samples of all texels.
     """
