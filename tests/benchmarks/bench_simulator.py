@@ -7,7 +7,7 @@ Every stage is timed on a few views by one thread and scaled to the dome, in sec
 processor, which another program does not change. The plain sums over pairs, which the tests
 hold the renderer to, are timed on the same points in the same run; so are rays for every
 pair instead of visibility traced once per light. With ``--whole`` the capture is written by
-two workers and timed as a whole.
+two workers and timed as a whole; ``--off 20`` compares effects that are off with none.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
+from capture_sim.effects.registry import decided
 from capture_sim.files import write_exr
 from capture_sim.memory import parse_bytes
 from capture_sim.model import EffectOptions, TruthOptions
+from capture_sim.photograph import photographs, set_up
 from capture_sim.rays import RayTracer, towards_camera
 from capture_sim.render import (
     arriving_light,
@@ -34,7 +36,7 @@ from capture_sim.render import (
     shade,
     traced_lights,
 )
-from capture_sim.scene import parse_scene
+from capture_sim.scene import load_scene, parse_scene
 from capture_sim.write import write_capture
 
 DIRECT = EffectOptions(simulate=("antialiasing", "near_lights", "shadows"))
@@ -145,6 +147,29 @@ def report(scene, n_views):
     assert errors[1] < 1e-3, "visibility at nodes is no longer next to exact"
 
 
+def off_is_free(n_runs):
+    """Time with every effect described and off, over that of shading and nothing else."""
+    scene = load_scene("vase")
+    nothing = replace(scene.effects, simulate="none")
+    off = decided(replace(scene, effects=nothing))
+    bare = replace(scene, effects=EffectOptions(simulate="none", active=frozenset()))
+    tracer, lights = RayTracer(scene.mesh), np.arange(len(scene.lights))
+
+    def described():
+        real = set_up(off).real
+        return [image for _, image in photographs(real, tracer, 0, lights)]
+
+    def shaded():
+        view = sample_view(bare, tracer, bare.cameras[0])
+        return [image for _, image in render_view(bare, tracer, view)]
+
+    assert np.array_equal(described(), shaded()), "an effect that is off left a trace"
+    times = np.array([[seconds(described)[0], seconds(shaded)[0]] for _ in range(n_runs)])
+    ratio = np.divide(*np.median(times, axis=0))
+    print(f"every effect described and off: {ratio:.2f} times the time of bare shading, "
+          f"medians of {n_runs} alternating runs; photographs equal bit by bit")  # fmt: skip
+
+
 def write_whole(scene, workers, max_memory):
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
         start, spent = time.perf_counter(), time.process_time()
@@ -171,7 +196,11 @@ def main():
     parser.add_argument("--whole", action="store_true", help="write the whole capture too")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--max-memory", default="4GB", help="ceiling of the whole capture")
+    parser.add_argument("--off", type=int, metavar="RUNS", help="only: what is off is free")
     options = parser.parse_args()
+    if options.off:
+        off_is_free(options.off)
+        return
     scene = dome(options.rig, options.object, options.material, options.side)
     report(scene, options.views)
     if options.whole:
