@@ -49,11 +49,18 @@ frames = 4
 per_view = false
 points = {points}
 """
-# Works of the stages that go texel by texel; of the others the number of texels is no matter.
+# Works of the stages that go texel by texel: all texels that are seen, but for those that
+# shape the basis in the first. Of the other works the number of texels is no matter.
+COMPLETING = "completing all texels"
 BY_TEXELS = {
-    "completion": ("completing all texels",),
+    "completion": (COMPLETING,),
     "alignment": ("frames on the samples",),
-    "compression": ("completing all texels",),
+    "compression": (
+        COMPLETING,
+        "frames against the model",
+        "coefficients on the samples, part 1",
+        "coefficients on the samples, part 2",
+    ),
 }
 
 
@@ -188,9 +195,12 @@ def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
         others = seen - completion["texels that shape the basis"]
         parts = []
         for name, works in BY_TEXELS.items():
-            n = seen if name == "alignment" else others
-            seconds = sum(stages[name]["work"].get(work, 0.0) for work in works)
-            parts.append(1e3 * seconds / max(n, 1))
+            spent = stages[name]["work"]
+            each = [
+                spent.get(work, 0.0) / max(others if work == COMPLETING else seen, 1)
+                for work in works
+            ]
+            parts.append(1e3 * sum(each))
         totals.append(sum(parts))
         shown = "".join(f"{part:9.2f}" for part in (*parts, totals[-1]))
         print(f"{side:4d} x {side:4d} {seen:9d} {shown}", flush=True)
