@@ -149,6 +149,12 @@ def run(
     hold_out: Annotated[
         str, typer.Option(metavar="views=K,lights=K", help="Kept for comparison.")
     ] = "",
+    size: Annotated[
+        str, typer.Option(metavar="2MB", help="Of the field; the best field of that size.")
+    ] = "",
+    psnr: Annotated[
+        float, typer.Option(metavar="DB", help="Of the field; the smallest that is as good.")
+    ] = 0.0,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Compute again from here.")
     ] = None,
@@ -171,7 +177,9 @@ def run(
     from reflfield.pipeline import run as run_pipeline
 
     started = time.perf_counter()
-    options = pipeline_options(config, set_ or [])
+    asked = [f"compression.size={parse_bytes(size, '--size')}"] if size else []
+    asked += [f"compression.psnr={psnr}"] if psnr else []
+    options = pipeline_options(config, [*(set_ or []), *asked])
     resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler, store)
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own

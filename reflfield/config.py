@@ -260,7 +260,7 @@ def gigabytes(size: float) -> str:
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
-def parse_bytes(text: str) -> int:
+def parse_bytes(text: str, option: str = "--max-memory") -> int:
     """Bytes of a size such as ``4GB`` or ``512MB`` (powers of 1024).
 
     Raises
@@ -279,7 +279,7 @@ def parse_bytes(text: str) -> int:
         return int(float(digits) * _UNITS[upper[len(digits) :]])
     except (ValueError, KeyError, OverflowError):
         raise InputError(
-            f"--max-memory: expected a number with MB or GB, such as 4GB, received {text!r}"
+            f"{option}: expected a number with MB or GB, such as 4GB, received {text!r}"
         ) from None
 
 

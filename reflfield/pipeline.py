@@ -121,7 +121,7 @@ ORDER = (
     Stage(
         "without_alignment",
         reflectance.write_without_alignment,
-        after=("observations",),
+        after=("compression",),
         options=lambda options: (options.compression, options.resampling, options.seed),
         reads=lambda job: {"name": job.capture.name},
         wanted=lambda options: options.compares_without_alignment,

@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 from reflfield.errors import InputError
 from reflfield.factorization import Completion, LocalPCA
 from reflfield.field.fit import ClusteredModel, SampleFitOptions
-from reflfield.field.model import Quantisation
 
 Floats = NDArray[np.float32]
 
@@ -47,7 +46,15 @@ class CompressionOptions:
     training_texels : int
         Texels that shape the completion's basis.
     samples : SampleFitOptions
-    quantisation : Quantisation
+    size : int
+        Bytes that the file may have, 0: as many as `coarseness` gives. Clusters, components
+        and quantisation are then chosen by the error that they leave; see `field.rate`.
+    psnr : float
+        LDR PSNR, dB, that the field is to have on the samples that it is made of, 0: as it
+        comes. Clusters, components and quantisation are then chosen for the smallest file.
+    coarseness : float
+        Quantisation step of the field over the root mean square residual of the fit. At a
+        half, quantisation adds some percent to the error; see `Quantisation`.
     """
 
     n_clusters: int = 8
@@ -56,7 +63,9 @@ class CompressionOptions:
     rank: int = 16
     training_texels: int = 8192
     samples: SampleFitOptions = field(default_factory=SampleFitOptions)
-    quantisation: Quantisation = field(default_factory=Quantisation)
+    size: int = 0
+    psnr: float = 0.0
+    coarseness: float = 0.5
 
     def __post_init__(self) -> None:
         if self.fit not in ("auto", "samples", "grid"):
@@ -68,11 +77,21 @@ class CompressionOptions:
             ("n_components", 0),
             ("rank", 1),
             ("training_texels", 1),
+            ("size", 0),
         ):
             if getattr(self, name) < least:
                 raise InputError(
                     f"{name}: expected at least {least}, received {getattr(self, name)}"
                 )
+        if not 0 <= self.psnr < float("inf"):
+            raise InputError(f"psnr: expected >= 0 dB, received {self.psnr}")
+        if self.size and self.psnr:
+            raise InputError(
+                f"size, psnr: expected one of them, received {self.size} bytes and "
+                f"{self.psnr} dB"
+            )
+        if not 0 < self.coarseness < float("inf"):
+            raise InputError(f"coarseness: expected > 0, received {self.coarseness}")
 
     def fits_samples(self, n_samples: float) -> bool:
         """Whether to fit to the samples, of which a texel has `n_samples` on average.
@@ -123,6 +142,8 @@ def cluster_completed(
     table = np.concatenate([means[:, :, None], bases], axis=2)
     table = table.reshape(len(means), *node_counts, 3, n_components + 1)
     table = np.swapaxes(table, 3, 4).reshape(len(means), *node_counts, -1)
+    # Of the coefficients in an orthonormal basis; here per row of the columns.
+    left_out = local.residual**2 * completion.rank / len(completion.mean)
     model = ClusteredModel(
         cluster=np.zeros(len(coefficients), np.int32),
         coefficients=np.zeros((len(coefficients), n_components), np.float32),
@@ -130,6 +151,7 @@ def cluster_completed(
         precision=_precision(
             local.labels, local.coefficients, completion.noise, local.n_clusters
         ),
+        residuals=(float(np.sqrt(left_out + completion.noise**2)),),
     )
     model.cluster[observed] = local.labels
     model.coefficients[observed] = local.coefficients

@@ -1,14 +1,13 @@
-"""The file of a reflectance field, `field.rfld`, version 1.
+"""The file of a reflectance field, `field.rfld`, version 2.
 
-A ZIP archive of `header.json` and one NumPy `.npy` member for each array of
-`model.ARRAYS`. The header names format and version and, for each array, its
-dtype, shape, filter and the SHA-256 of its member. Integers are deflated;
-index arrays are first replaced by their differences, which deflate to a small
-part of their size. Time stamps are fixed, so equal fields give equal bytes.
+A ZIP archive of `header.json` and one member for each array of `model.ARRAYS`, packed as
+`packing` describes. The header names format and version and, for each array, its dtype,
+shape, filter, context bits and the SHA-256 of its member. Time stamps are fixed, so equal
+fields give equal bytes.
 
 Opening reads the header alone; an array is read, and its checksum compared,
 when it is first used. Nothing is unpickled, nothing is extracted to disk, and
-no size is believed before it was compared with the size of the file.
+no size is believed before it was compared with what the bytes hold.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +37,11 @@ from reflfield.field.model import (
     check_options,
     node_side,
 )
+from reflfield.field.packing import FILTERS, pack, unpack
 
 FORMAT_NAME = "reflfield-field"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+OLDEST_VERSION = 2
 
 HEADER = "header.json"
 MAX_HEADER_BYTES = 16 << 20
@@ -49,18 +50,13 @@ MAX_HEADER_BYTES = 16 << 20
 # declares more is damaged or hostile. `open_field` takes another limit.
 MAX_BYTES = 8 << 30
 
-# An .npy header of version 1.0 is shorter than this; longer members do not fit
-# the array that they declare.
-NPY_HEADER_BYTES = 4096
-
-# Deflate cannot shrink by more than this factor (RFC 1951: 258 bytes in 2 bits).
-DEFLATE_LIMIT = 1032
-
 # The oldest date a ZIP archive can hold.
 FIXED_TIME = (1980, 1, 1, 0, 0, 0)
 
-# Index arrays are smooth: differences deflate better.
-DELTA_ARRAYS = ("faces", "texel_of_pixel")
+# Arrays that are smooth down their rows, whose differences are smaller; those that are not here
+# are packed both ways, and the better one is kept.
+KNOWN_FILTERS = {"faces": "fresh", "texel_of_pixel": "delta", "turns": "none"}
+TRIED_FILTERS = ("none", "delta")
 
 
 def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
@@ -80,14 +76,39 @@ def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
     OSError
         If the target cannot be written.
     """
-    with _replacing(Path(path)) as file, zipfile.ZipFile(file, "w") as archive:
-        members = {n: _npy_bytes(n, reflectance_field.arrays[n]) for n in ARRAYS}
-        header = _header(reflectance_field, members)
-        _add(archive, HEADER, header, zipfile.ZIP_DEFLATED)
-        for name, content in members.items():
-            packs = reflectance_field.arrays[name].dtype.kind in "iu"
-            method = zipfile.ZIP_DEFLATED if packs else zipfile.ZIP_STORED
-            _add(archive, member_name(name), content, method)
+    with _replacing(Path(path)) as file:
+        members = {n: packed_array(n, reflectance_field.arrays[n]) for n in ARRAYS}
+        _write_archive(file, reflectance_field, members)
+
+
+class PackedSizes:
+    """Sizes of files of fields that share arrays, each of which is packed once."""
+
+    def __init__(self) -> None:
+        self._packed: dict[tuple[str, bytes], PackedArray] = {}
+
+    def of(self, reflectance_field: ReflectanceField) -> int:
+        """Bytes of the file that `write_field` would write."""
+        members = {n: self._array(n, reflectance_field.arrays[n]) for n in ARRAYS}
+        buffer = io.BytesIO()
+        _write_archive(buffer, reflectance_field, members)
+        return buffer.tell()
+
+    def _array(self, name: str, array: NDArray[Any]) -> PackedArray:
+        described = f"{array.dtype}{array.shape}".encode()
+        key = (name, hashlib.sha256(described + array.tobytes()).digest())
+        if key not in self._packed:
+            self._packed[key] = packed_array(name, array)
+        return self._packed[key]
+
+
+def _write_archive(
+    file: IO[bytes], reflectance_field: ReflectanceField, members: Mapping[str, PackedArray]
+) -> None:
+    with zipfile.ZipFile(file, "w") as archive:
+        _add(archive, HEADER, _header(reflectance_field, members))
+        for name, packed in members.items():
+            _add(archive, member_name(name), packed.content)
 
 
 def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceField:
@@ -116,9 +137,17 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
         header = _read_header(path, archive)
         infos = _members(path, archive)
         declared = _declared(path, header)
-        for name, array in declared.items():
-            _check_size(path, name, array, infos[member_name(name)])
-    total = sum(array.n_bytes for array in declared.values())
+        if any(
+            infos[member_name(name)].compress_type != zipfile.ZIP_STORED for name in declared
+        ):
+            raise FieldFileError(f"{path}: expected stored members, received packed ones")
+    # The functions of the clusters are held decoded.
+    decoded = (
+        declared["function_gain"].n_bytes
+        * 3
+        * prod(declared[f"{which}_factor"].shape[0] for which in ("view", "light"))
+    )
+    total = decoded + sum(array.n_bytes for array in declared.values())
     if total > max_bytes:
         raise FieldFileError(
             f"{path}: expected arrays of at most {max_bytes} bytes, the header declares "
@@ -135,6 +164,7 @@ class DeclaredArray:
     dtype: str
     shape: tuple[int, ...]
     filter: str
+    context_bits: int
     sha256: str
 
     @property
@@ -180,20 +210,30 @@ class StoredArrays(Mapping[str, NDArray[Any]]):
 
 def member_name(array: str) -> str:
     """Name of an array's member in the archive."""
-    return f"{array}.npy"
+    return f"{array}.bin"
 
 
-def _npy_bytes(name: str, array: NDArray[Any]) -> bytes:
-    """The `.npy` form of an array, little-endian, in C order, filtered."""
-    if name in DELTA_ARRAYS:
-        array = np.diff(array.ravel(), prepend=array.dtype.type(0)).reshape(array.shape)
-    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, little, version=(1, 0), allow_pickle=False)
-    return buffer.getvalue()
+@dataclass(frozen=True)
+class PackedArray:
+    """Bytes of an array with what they were packed by."""
+
+    content: bytes
+    filter: str
+    context_bits: int
 
 
-def _header(reflectance_field: ReflectanceField, members: Mapping[str, bytes]) -> bytes:
+def packed_array(name: str, array: NDArray[Any]) -> PackedArray:
+    """Pack one of a field's arrays, in the better of the ways that are tried for it."""
+    filters = (KNOWN_FILTERS[name],) if name in KNOWN_FILTERS else TRIED_FILTERS
+    if array.dtype.kind == "f" or array.shape[0] < 2:
+        filters = ("none",)
+    found = [
+        PackedArray(content, f, bits) for f in filters for content, bits in [pack(array, f)]
+    ]
+    return min(found, key=lambda packed: len(packed.content))
+
+
+def _header(reflectance_field: ReflectanceField, members: Mapping[str, PackedArray]) -> bytes:
     arrays = reflectance_field.arrays
     header = {
         "format": FORMAT_NAME,
@@ -208,10 +248,11 @@ def _header(reflectance_field: ReflectanceField, members: Mapping[str, bytes]) -
             name: {
                 "dtype": arrays[name].dtype.name,
                 "shape": list(arrays[name].shape),
-                "filter": "delta" if name in DELTA_ARRAYS else "none",
-                "sha256": hashlib.sha256(content).hexdigest(),
+                "filter": packed.filter,
+                "context_bits": packed.context_bits,
+                "sha256": hashlib.sha256(packed.content).hexdigest(),
             }
-            for name, content in members.items()
+            for name, packed in members.items()
         },
     }
     try:
@@ -222,12 +263,12 @@ def _header(reflectance_field: ReflectanceField, members: Mapping[str, bytes]) -
         ) from error
 
 
-def _add(archive: zipfile.ZipFile, name: str, content: bytes, method: int) -> None:
+def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
     info = zipfile.ZipInfo(name, FIXED_TIME)
-    info.compress_type = method
+    info.compress_type = zipfile.ZIP_STORED
     info.create_system = 3  # Unix, wherever it is written
     info.external_attr = 0o644 << 16
-    archive.writestr(info, content, compresslevel=9)
+    archive.writestr(info, content)
 
 
 @contextmanager
@@ -318,6 +359,11 @@ def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
             f"{path}: written in version {version} of the format, this program reads up to "
             f"{FORMAT_VERSION}; install a newer reflfield"
         )
+    if version < OLDEST_VERSION:
+        raise FieldFileError(
+            f"{path}: written in version {version} of the format, this program reads from "
+            f"{OLDEST_VERSION} on; make the field again with `reflfield run`"
+        )
     return header
 
 
@@ -329,13 +375,14 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
                 str(entry["dtype"]),
                 tuple(_length(n) for n in entry["shape"]),
                 str(entry["filter"]),
+                _length(entry["context_bits"]),
                 str(entry["sha256"]),
             )
             for name, entry in header["arrays"].items()
         }
         check_arrays({name: (a.dtype, a.shape) for name, a in declared.items()})
         for name, array in declared.items():
-            if array.filter not in ("none", "delta"):
+            if array.filter not in FILTERS:
                 raise ValueError(f"{name}: unknown filter {array.filter!r}")
         check_options(header["domain"], header["visibility"], header["light_model"])
     return declared
@@ -347,62 +394,38 @@ def _length(value: Any) -> int:
     return value
 
 
-def _check_size(path: Path, name: str, array: DeclaredArray, info: zipfile.ZipInfo) -> None:
-    """Demand that a member can hold just the array it declares."""
-    surplus = info.file_size - array.n_bytes
-    if not 0 < surplus < NPY_HEADER_BYTES:
-        raise FieldFileError(
-            f"{path}: {name}: expected about {array.n_bytes} bytes for shape "
-            f"{array.shape}, the archive holds {info.file_size}"
-        )
-    if info.file_size > DEFLATE_LIMIT * (info.compress_size + 64):
-        raise FieldFileError(
-            f"{path}: {name}: {info.compress_size} packed bytes cannot hold "
-            f"{info.file_size}; the sizes are forged"
-        )
-
-
 def _read_array(path: Path, name: str, declared: DeclaredArray) -> NDArray[Any]:
     with _archive(path) as archive:
-        info = archive.getinfo(member_name(name))
-        _check_size(path, name, declared, info)
-        with archive.open(info) as member:
-            # One byte more than promised is enough to notice a false promise.
-            content = member.read(info.file_size + 1)
+        content = archive.read(member_name(name))
         if hashlib.sha256(content).hexdigest() != declared.sha256:
             raise FieldFileError(
                 f"{path}: {name}: the checksum differs from the header's: the file is "
                 "damaged or was replaced while open"
             )
-        array = _from_npy(name, content, declared)
-    native = array.astype(array.dtype.newbyteorder("="))
-    if declared.filter == "delta":
-        native = np.cumsum(native.ravel(), dtype=native.dtype).reshape(native.shape)
-    native.setflags(write=False)
-    return native
-
-
-def _from_npy(name: str, content: bytes, declared: DeclaredArray) -> NDArray[Any]:
-    """The array of an `.npy` member; nothing is allocated on the word of its header."""
-    buffer = io.BytesIO(content)
-    if np.lib.format.read_magic(buffer) != (1, 0):
-        raise ValueError(f"{name}: expected .npy version 1.0")
-    shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(buffer)
-    if dtype.name != declared.dtype or shape != declared.shape or in_fortran_order:
-        raise ValueError(
-            f"{name}: expected {declared.dtype} {declared.shape}, received {dtype.name} {shape}"
-        )
-    return np.frombuffer(content, dtype, prod(shape), buffer.tell()).reshape(shape)
+        try:
+            array = unpack(
+                content,
+                np.dtype(declared.dtype),
+                declared.shape,
+                declared.filter,
+                declared.context_bits,
+            )
+        except ValueError as error:
+            raise FieldFileError(f"{path}: {name}: {error}") from error
+    array.setflags(write=False)
+    return array
 
 
 def _field(
     header: Mapping[str, Any], declared: Mapping[str, DeclaredArray], arrays: StoredArrays
 ) -> ReflectanceField:
-    _, n_view_nodes, n_light_nodes, _ = declared["mean"].shape
+    n_view_nodes, n_light_nodes = (
+        declared[f"{which}_factor"].shape[0] for which in ("view", "light")
+    )
     return ReflectanceField(
         arrays=arrays,
-        view_side=node_side("mean", n_view_nodes),
-        light_side=node_side("mean", n_light_nodes),
+        view_side=node_side("view_factor", n_view_nodes),
+        light_side=node_side("light_factor", n_light_nodes),
         domain=header["domain"],
         visibility=header["visibility"],
         light_model=header["light_model"],

@@ -14,8 +14,9 @@ cosine, rounded at the horizon (`sphere.hemisphere.softened_cosine`), or 1 where
 direction of the light does not vary. It stands outside the interpolation because its
 root falls to the horizon too steeply for any grid.
 
-Arrays are kept as they are stored, quantised; properties decode them when
-first asked for. A field opened from a file reads only what is used.
+Arrays are kept as they are stored, quantised (`field.transform`, `field.quantisation`);
+properties decode them when first asked for. A field opened from a file reads only what is
+used.
 """
 
 from __future__ import annotations
@@ -28,19 +29,24 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError, ShapeError
 from reflfield.field.quantisation import (
-    CodeKind,
-    QuantisedArray,
+    SMALLEST_TURN,
+    QuantisedBox,
     check_finite,
-    check_kind,
     codes_from_rotations,
-    encode,
-    quantise,
+    lattice_points,
     rotations_from_codes,
-    scale_of,
+)
+from reflfield.field.transform import (
+    factor_table,
+    lattice_codes,
+    smallest_codes,
+    unfactor_table,
 )
 
 Domain = Literal["cube_root", "square_root", "linear"]
@@ -52,50 +58,74 @@ INVERSE_POWER = {"cube_root": 3, "square_root": 2, "linear": 1}
 VISIBILITIES = ("kept", "factored")
 LIGHT_MODELS = ("known", "unknown")
 
-_CODES = ("int8", "int16", "float16")
+_CODES = ("int8", "int16", "int32")
 
 # Stored arrays in file order: the dtypes allowed and the axes, by name. An axis
 # that appears in several arrays must have one length; a number is a fixed one.
 ARRAYS: dict[str, tuple[tuple[str, ...], tuple[str | int, ...]]] = {
-    "positions": (("float32",), ("n_vertices", 3)),
+    "positions": (("uint16",), ("n_vertices", 3)),
+    "position_box": (("float32",), (4,)),
     "faces": (("int32",), ("n_faces", 3)),
-    "uv": (("float32",), ("n_vertices", 2)),
+    "uv": (("uint16",), ("n_vertices", 2)),
+    "uv_box": (("float32",), (3,)),
     "texel_of_pixel": (("int32",), ("height", "width")),
-    "base_frames": (("uint16",), ("n_texels", 3)),
-    "local_frames": (("uint16",), ("n_texels", 3)),
+    "turns": (("int16",), ("n_texels", 3)),
+    "turn_step": (("float32",), (1,)),
     "cluster": (("uint8", "uint16"), ("n_texels",)),
     "coefficients": (_CODES, ("n_texels", "n_components")),
     "coefficient_scale": (("float32",), ("n_clusters", "n_components")),
-    "mean": (_CODES, ("n_clusters", "n_view_nodes", "n_light_nodes", 3)),
-    "mean_scale": (("float32",), ("n_clusters",)),
-    "basis": (_CODES, ("n_clusters", "n_components", "n_view_nodes", "n_light_nodes", 3)),
-    "basis_scale": (("float32",), ("n_clusters", "n_components")),
+    "function_factor": (_CODES, ("n_clusters", "n_functions", "function_rank")),
+    "function_scale": (("float32",), ("function_rank",)),
+    "function_gain": (("float32",), ("n_clusters", "n_functions")),
+    "view_factor": (_CODES, ("n_view_nodes", "view_rank")),
+    "view_scale": (("float32",), ("view_rank",)),
+    "light_factor": (_CODES, ("n_light_nodes", "light_rank")),
+    "light_scale": (("float32",), ("light_rank",)),
+    "colour_factor": (("float32",), (3, 3)),
+    "core": (_CODES, ("function_rank", "view_rank", "light_rank", 3)),
+    "core_scale": (("float32",), (1,)),
 }
+
+# Steps along the longest side of the object: .01 mm of 16 cm, a hundredth of a texel.
+POSITION_STEPS = 16383
+UV_STEPS = 32767
+# Where no step is asked for, this share of the root mean square of the means: beyond what any
+# capture holds.
+FINEST_SHARE = 1e-5
+FINEST_TURN = np.deg2rad(0.01)
+COARSEST_TURN = np.deg2rad(1.0)
 
 
 @dataclass(frozen=True)
 class Quantisation:
-    """How many bits the parts of a field get.
+    """How many bits a field gets.
 
     Parameters
     ----------
-    coefficients, basis, mean : {"int8", "int16", "float16"}
-        Code of each part. Coefficients and basis have one scale for each
-        cluster and component, the mean one for each cluster.
+    step : float
+        Quantisation step of every coefficient and, weighted by what the texels make of it,
+        of every number of the functions, in root mean square over the nodes in the
+        domain: each adds a twelfth of its square to the squared error. 0: as fine as is
+        of any use.
+    turn_deg : float
+        Step of the frames, degrees about each axis. 0: the one at which a frame adds as much
+        error as a coefficient.
 
     Raises
     ------
     InputError
-        If a kind is unknown.
+        If a number is negative or not finite.
     """
 
-    coefficients: CodeKind = "int16"
-    basis: CodeKind = "int8"
-    mean: CodeKind = "int16"
+    step: float = 0.0
+    turn_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("coefficients", "basis", "mean"):
-            check_kind(f"quantisation.{name}", getattr(self, name))
+        for name in ("step", "turn_deg"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(
+                    f"quantisation.{name}: expected >= 0, received {getattr(self, name)}"
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,15 +143,12 @@ class BaseSurface:
     texel_of_pixel : (height, width) int
         Nearest texel of each texture pixel, gutter included; -1 where none.
         Row 0 is the top, v = 1.
-    base_from_world : (n_texels, 3, 3) float
-        Base frames, rows tangent, binormal, normal.
     """
 
     positions: NDArray[np.floating]
     faces: NDArray[np.integer]
     uv: NDArray[np.floating]
     texel_of_pixel: NDArray[np.integer]
-    base_from_world: NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,14 +211,14 @@ class ReflectanceField:
     @cached_property
     def positions(self) -> NDArray[np.float32]:
         """(n_vertices, 3) float32 vertices, metres, world frame."""
-        check_finite("positions", self.arrays["positions"])
-        return self.arrays["positions"]
+        check_finite("position_box", self.arrays["position_box"])
+        return QuantisedBox(self.arrays["positions"], self.arrays["position_box"]).decode()
 
     @cached_property
     def uv(self) -> NDArray[np.float32]:
         """(n_vertices, 2) float32 texture coordinates, v up."""
-        check_finite("uv", self.arrays["uv"])
-        return self.arrays["uv"]
+        check_finite("uv_box", self.arrays["uv_box"])
+        return QuantisedBox(self.arrays["uv"], self.arrays["uv_box"]).decode()
 
     @cached_property
     def faces(self) -> NDArray[np.int32]:
@@ -209,33 +236,19 @@ class ReflectanceField:
     def cluster(self) -> NDArray[np.int32]:
         """(n_texels,) int32 cluster of each texel."""
         wide = self.arrays["cluster"].astype(np.int32)
-        return _indices("cluster", wide, 0, len(self.arrays["mean_scale"]))
-
-    @cached_property
-    def base_from_world(self) -> NDArray[np.float32]:
-        """(n_texels, 3, 3) float32 base frames."""
-        return rotations_from_codes(self.arrays["base_frames"])
+        return _indices("cluster", wide, 0, self.n_clusters)
 
     @cached_property
     def local_from_world(self) -> NDArray[np.float32]:
         """(n_texels, 3, 3) float32 aligned frames."""
-        return rotations_from_codes(self.arrays["local_frames"])
+        step = float(self.arrays["turn_step"][0])
+        return rotations_from_codes(self.arrays["turns"], step)
 
     @cached_property
     def coefficients(self) -> NDArray[np.float32]:
         """(n_texels, K) float32 weights of the basis functions."""
         scale = self.arrays["coefficient_scale"][self.cluster]
         return self.arrays["coefficients"].astype(np.float32) * scale
-
-    @property
-    def mean(self) -> NDArray[np.float32]:
-        """(n_clusters, n_view_nodes, n_light_nodes, 3) float32, decoded at each call."""
-        return QuantisedArray(self.arrays["mean"], self.arrays["mean_scale"]).decode()
-
-    @property
-    def basis(self) -> NDArray[np.float32]:
-        """(n_clusters, K, n_view_nodes, n_light_nodes, 3) float32, decoded at each call."""
-        return QuantisedArray(self.arrays["basis"], self.arrays["basis_scale"]).decode()
 
     @cached_property
     def node_table(self) -> NDArray[np.float32]:
@@ -245,12 +258,21 @@ class ReflectanceField:
         memory. This is the largest thing a field needs: 31 MB for 16 clusters of
         10 components on 11 x 11 nodes for each direction, 411 MB on 21 x 21.
         """
-        mean = self.mean
-        n_clusters, n_views, n_lights, _ = mean.shape
-        table = np.zeros((n_clusters, n_views, n_lights, self.n_components + 1, 3), np.float32)
-        table[..., 0, :] = mean
-        table[..., 1:, :] = np.moveaxis(self.basis, 1, 3)
-        return table
+        for name in ("function", "view", "light", "core"):
+            check_finite(f"{name}_scale", self.arrays[f"{name}_scale"])
+        check_finite("function_gain", self.arrays["function_gain"])
+        check_finite("colour_factor", self.arrays["colour_factor"])
+        return np.ascontiguousarray(np.moveaxis(unfactor_table(self.arrays), 1, 3))
+
+    @property
+    def mean(self) -> NDArray[np.float32]:
+        """(n_clusters, n_view_nodes, n_light_nodes, 3) float32."""
+        return self.node_table[..., 0, :]
+
+    @property
+    def basis(self) -> NDArray[np.float32]:
+        """(n_clusters, K, n_view_nodes, n_light_nodes, 3) float32."""
+        return np.moveaxis(self.node_table[..., 1:, :], 3, 1)
 
     @cached_property
     def component_weights(self) -> NDArray[np.float32]:
@@ -266,12 +288,12 @@ class ReflectanceField:
     @property
     def n_clusters(self) -> int:
         """Number of clusters."""
-        return len(self.arrays["mean_scale"])
+        return len(self.arrays["coefficient_scale"])
 
     @property
     def n_components(self) -> int:
         """Number of basis functions of a cluster."""
-        return int(self.arrays["basis_scale"].shape[1])
+        return int(self.arrays["coefficient_scale"].shape[1])
 
     @property
     def inverse_power(self) -> int:
@@ -304,7 +326,7 @@ def build_field(
     metadata : mapping, optional
         Plain JSON values to keep with the field.
     quantisation : Quantisation, optional
-        Bits of each part.
+        How many bits the numbers get.
 
     Returns
     -------
@@ -327,7 +349,6 @@ def build_field(
     ...     faces=np.array([[0, 1, 2], [0, 2, 3]]),
     ...     uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32),
     ...     texel_of_pixel=np.zeros((1, 1), int),
-    ...     base_from_world=np.eye(3)[None],
     ... )
     >>> reflectance = FittedReflectance(
     ...     local_from_world=np.eye(3)[None], cluster=np.zeros(1, int),
@@ -339,12 +360,14 @@ def build_field(
     (1, 1, 0.1)
     """
     bits = quantisation or Quantisation()
+    _check_reflectance(reflectance)
+    sides = [node_side("mean", n) for n in reflectance.mean.shape[1:3]]
     arrays = _surface_arrays(surface) | _reflectance_arrays(reflectance, bits)
-    sizes = check_arrays({name: (a.dtype.name, a.shape) for name, a in arrays.items()})
+    check_arrays({name: (a.dtype.name, a.shape) for name, a in arrays.items()})
     built = ReflectanceField(
         arrays=arrays,
-        view_side=node_side("mean", sizes["n_view_nodes"]),
-        light_side=node_side("mean", sizes["n_light_nodes"]),
+        view_side=sides[0],
+        light_side=sides[1],
         domain=reflectance.domain,
         visibility=visibility,
         light_model=light_model,
@@ -400,6 +423,11 @@ def check_arrays(declared: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[st
         if dtype not in dtypes:
             raise ShapeError(f"{name}: expected dtype {' or '.join(dtypes)}, received {dtype}")
         _check_axes(name, shape, axes, lengths)
+    if lengths["n_functions"] != lengths["n_components"] + 1:
+        raise ShapeError(
+            f"function_factor: expected {lengths['n_components'] + 1} functions, the mean and "
+            f"one a component, received {lengths['n_functions']}"
+        )
     return lengths
 
 
@@ -432,43 +460,177 @@ def _check_axes(
 
 
 def _surface_arrays(surface: BaseSurface) -> dict[str, NDArray[Any]]:
+    check_finite("positions", surface.positions)
+    check_finite("uv", surface.uv)
+    check_shape("uv", surface.uv, (len(surface.positions), 2))
+    faces = _indices("faces", np.asarray(surface.faces), 0, len(surface.positions))
+    vertices, faces = neighbours_in_a_row(faces, len(surface.positions))
+    corners = lattice_points(np.asarray(surface.positions)[vertices], POSITION_STEPS)
+    uv = lattice_points(np.asarray(surface.uv)[vertices], UV_STEPS)
     return {
-        "positions": np.ascontiguousarray(surface.positions, np.float32),
-        "faces": np.ascontiguousarray(surface.faces, np.int32),
-        "uv": np.ascontiguousarray(surface.uv, np.float32),
+        "positions": corners.codes,
+        "position_box": corners.box,
+        "faces": np.ascontiguousarray(faces, np.int32),
+        "uv": uv.codes,
+        "uv_box": uv.box,
         "texel_of_pixel": np.ascontiguousarray(surface.texel_of_pixel, np.int32),
-        "base_frames": codes_from_rotations(surface.base_from_world),
     }
 
 
-def _reflectance_arrays(
-    reflectance: FittedReflectance, bits: Quantisation
-) -> dict[str, NDArray[Any]]:
-    mean = np.asarray(reflectance.mean)
-    basis = np.asarray(reflectance.basis)
+def neighbours_in_a_row(
+    faces: NDArray[np.integer], n_vertices: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Order in which triangles follow their neighbours, and vertices their triangles.
+
+    Parameters
+    ----------
+    faces : (n, 3) int
+    n_vertices : int
+
+    Returns
+    -------
+    vertices : (n_vertices,) int
+        Old number of each new vertex, in the order of first use; unused ones last.
+    faces : (n, 3) int
+        In the new order and numbers; corners in their cyclic order.
+
+    Examples
+    --------
+    >>> neighbours_in_a_row(np.array([[3, 1, 2]]), 4)[0]
+    array([3, 1, 2, 0])
+    """
+    corner_of = coo_array(
+        (np.ones(faces.size, np.int32), (np.repeat(np.arange(len(faces)), 3), faces.ravel())),
+        shape=(len(faces), n_vertices),
+    ).tocsr()
+    order = reverse_cuthill_mckee(csr_array(corner_of @ corner_of.T), symmetric_mode=True)
+    ordered = np.asarray(faces)[order]
+    used, first = np.unique(ordered, return_index=True)
+    unused = np.setdiff1d(np.arange(n_vertices), used)
+    vertices = np.concatenate([used[np.argsort(first)], unused]).astype(np.intp)
+    new_number = np.zeros(n_vertices, np.intp)
+    new_number[vertices] = np.arange(n_vertices)
+    return vertices, new_number[ordered]
+
+
+def _check_reflectance(reflectance: FittedReflectance) -> None:
+    mean, basis = np.asarray(reflectance.mean), np.asarray(reflectance.basis)
     check_shape("mean", mean, (None, None, None, 3))
     check_shape("basis", basis, (len(mean), None, *mean.shape[1:]))
     cluster = np.asarray(reflectance.cluster)
     check_shape("cluster", cluster, (None,))
     _indices("cluster", cluster, 0, len(mean))
-    coefficients = np.asarray(reflectance.coefficients, np.float64)
+    coefficients = np.asarray(reflectance.coefficients)
     check_shape("coefficients", coefficients, (len(cluster), basis.shape[1]))
-    check_finite("coefficients", coefficients)
-    largest = np.zeros(basis.shape[:2])
-    np.maximum.at(largest, cluster, np.abs(coefficients))
-    coefficient_scale = scale_of(largest, bits.coefficients)
-    mean_codes = quantise(mean, bits.mean, n_group_axes=1)
-    basis_codes = quantise(basis, bits.basis, n_group_axes=2)
+    check_shape("local_from_world", reflectance.local_from_world, (len(cluster), 3, 3))
+    for name in ("mean", "basis", "coefficients"):
+        check_finite(name, getattr(reflectance, name))
+
+
+def _reflectance_arrays(
+    reflectance: FittedReflectance, bits: Quantisation
+) -> dict[str, NDArray[Any]]:
+    mean, basis = np.asarray(reflectance.mean), np.asarray(reflectance.basis)
+    cluster = np.asarray(reflectance.cluster)
+    table = np.concatenate([mean[:, None], basis], axis=1)
+    step = bits.step or FINEST_SHARE * float(np.sqrt(np.mean(np.square(mean)))) or 1.0
+    factors = factor_table(table, function_weights(reflectance), step)
+    codes, scale = _coefficient_codes(reflectance, table, unfactor_table(factors), step)
+    turn = np.deg2rad(bits.turn_deg) or _matching_turn(table, reflectance, bits.step)
     return {
-        "local_frames": codes_from_rotations(reflectance.local_from_world),
+        **factors,
+        "turns": codes_from_rotations(reflectance.local_from_world, turn),
+        "turn_step": np.array([turn], np.float32),
         "cluster": cluster.astype(np.uint8 if len(mean) <= 256 else np.uint16),
-        "coefficients": encode(coefficients, coefficient_scale[cluster], bits.coefficients),
-        "coefficient_scale": coefficient_scale,
-        "mean": mean_codes.codes,
-        "mean_scale": mean_codes.scale,
-        "basis": basis_codes.codes,
-        "basis_scale": basis_codes.scale,
+        "coefficients": smallest_codes(codes),
+        "coefficient_scale": scale,
     }
+
+
+def function_weights(reflectance: FittedReflectance) -> NDArray[np.float64]:
+    """Root of the sum over texels of each function's squared factor, (n_clusters, K + 1)."""
+    n_clusters, n_components = reflectance.basis.shape[:2]
+    squares = np.zeros((n_clusters, n_components + 1))
+    squares[:, 0] = np.bincount(reflectance.cluster, minlength=n_clusters)
+    np.add.at(
+        squares[:, 1:],
+        reflectance.cluster,
+        np.square(reflectance.coefficients, dtype=np.float64),
+    )
+    return np.sqrt(squares)
+
+
+def _coefficient_codes(
+    reflectance: FittedReflectance,
+    table: NDArray[np.floating],
+    decoded: NDArray[np.float32],
+    step: float,
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Coefficients solved against the functions as they will be read, quantised."""
+    n_clusters, n_functions = table.shape[:2]
+    codes = np.zeros((len(reflectance.cluster), n_functions - 1), np.int32)
+    scale = np.zeros((n_clusters, n_functions - 1), np.float32)
+    for c in range(n_clusters):
+        given = table[c].reshape(n_functions, -1).astype(np.float64)
+        read = decoded[c].reshape(n_functions, -1).astype(np.float64)
+        members = np.flatnonzero(np.asarray(reflectance.cluster) == c)
+        gram = read[1:] @ read[1:].T / read.shape[1]
+        between = given[1:] @ read[1:].T / read.shape[1]
+        shift = (given[0] - read[0]) @ read[1:].T / read.shape[1]
+        moments = np.asarray(reflectance.coefficients)[members] @ between + shift
+        codes[members], scale[c] = lattice_codes(moments, gram, step)
+    return codes, scale
+
+
+def quantisation_error(given: FittedReflectance, field: ReflectanceField) -> float:
+    """Root mean square over texels and nodes, in the domain, of what quantisation changed.
+
+    From the Gram matrices of the functions before and after; no texel's nodes are formed.
+    """
+    total, n_nodes = 0.0, given.mean[0].size
+    for c in range(field.n_clusters):
+        members = np.flatnonzero(np.asarray(given.cluster) == c)
+        before = np.concatenate([given.mean[c][None], given.basis[c]]).reshape(-1, n_nodes)
+        after = np.moveaxis(field.node_table[c], 2, 0).reshape(-1, n_nodes)
+        both = np.concatenate([before, after]).astype(np.float64)
+        ones = np.ones((len(members), 1))
+        factors = np.concatenate(
+            [ones, given.coefficients[members], -ones, -field.coefficients[members]], axis=1
+        )
+        total += np.sum((factors @ (both @ both.T)) * factors)
+    return float(np.sqrt(max(total, 0.0) / (n_nodes * max(len(given.cluster), 1))))
+
+
+def _matching_turn(
+    table: NDArray[np.floating], reflectance: FittedReflectance, step: float
+) -> float:
+    """Step of the turns that adds as much error as `step` of a coefficient, radians."""
+    if not step > 0:
+        return float(FINEST_TURN)
+    counts = np.bincount(reflectance.cluster, minlength=len(table))
+    slope = np.sqrt(np.average(_squared_slopes(table[:, 0]), weights=counts))
+    turn = step / slope if slope > 0 else COARSEST_TURN
+    return float(np.clip(turn, max(FINEST_TURN, SMALLEST_TURN), COARSEST_TURN))
+
+
+def _squared_slopes(mean: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Mean squared change of each mean per radian of turn about a horizontal axis.
+
+    Nodes of a side of s lie about 2 sqrt(2) / (s - 1) apart where the map is not
+    stretched; a turn about a random axis moves a direction by root a half of its angle along
+    each of two.
+    """
+    total = np.zeros(len(mean))
+    for axis in (1, 2):
+        side = isqrt(mean.shape[axis])
+        if side > 1:
+            shape = (*mean.shape[:axis], side, side, *mean.shape[axis + 1 :])
+            spacing = 2.0 * np.sqrt(2.0) / (side - 1)
+            for along in (axis, axis + 1):
+                difference = np.diff(mean.reshape(shape), axis=along) / spacing
+                inner = tuple(range(1, difference.ndim))
+                total += 0.5 * np.mean(np.square(difference, dtype=np.float64), axis=inner)
+    return total
 
 
 def _indices(name: str, indices: NDArray[Any], lowest: int, end: int) -> NDArray[Any]:

@@ -1,15 +1,10 @@
-"""Few bits per number: scaled integers, scaled halves, 48-bit rotations.
-
-Arrays are scaled so that the largest magnitude of each group becomes the
-largest code. Rotations are stored as the three smaller components of their
-quaternion, 15 bits each, and two bits that say which one is missing.
-"""
+"""Few bits per number: points on a lattice, rotations as turns from one to the next."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,113 +12,8 @@ from reflfield.checks import check_shape
 from reflfield.errors import InputError
 from reflfield.sphere.rotations import matrix_from_quaternion, quaternion_from_matrix
 
-CodeKind = Literal["int8", "int16", "float16"]
-
-# Value of the code that the largest magnitude of a group is given.
-LARGEST_CODE = {"int8": 127.0, "int16": 32767.0, "float16": 1.0}
-
-# The three smaller components of a unit quaternion lie in +-1/sqrt(2); they are
-# spread over the codes 0 .. 32766, so that 0 has a code of its own.
-HALF_RANGE_CODE = 16383
-SMALLEST_THREE_BOUND = float(np.sqrt(0.5))
-
-
-@dataclass(frozen=True, eq=False)
-class QuantisedArray:
-    """Numbers as codes times a scale of their group.
-
-    Parameters
-    ----------
-    codes : (*group, ...) int8, int16 or float16
-        One code a number.
-    scale : (*group) float32
-        One scale for each index of the leading axes.
-
-    Examples
-    --------
-    >>> quantised = quantise(np.array([[0.5, -1.0], [100.0, 50.0]]), "int8", n_group_axes=1)
-    >>> quantised.codes
-    array([[  64, -127],
-           [ 127,   64]], dtype=int8)
-    >>> quantised.decode().round(2)
-    array([[  0.5 ,  -1.  ],
-           [100.  ,  50.39]], dtype=float32)
-    """
-
-    codes: NDArray[np.generic]
-    scale: NDArray[np.float32]
-
-    def decode(self) -> NDArray[np.float32]:
-        """Return the numbers, float32, in the shape of `codes`."""
-        trailing = (1,) * (self.codes.ndim - self.scale.ndim)
-        decoded = self.codes.astype(np.float32)
-        decoded *= self.scale.reshape(self.scale.shape + trailing)
-        return decoded
-
-
-def check_kind(name: str, kind: str) -> None:
-    """Demand one of the known code kinds.
-
-    Raises
-    ------
-    InputError
-        If `kind` is another word.
-    """
-    if kind not in LARGEST_CODE:
-        raise InputError(f"{name}: expected one of {sorted(LARGEST_CODE)}, received {kind!r}")
-
-
-def encode(
-    values: NDArray[np.floating], scale: NDArray[np.floating], kind: CodeKind
-) -> NDArray[np.generic]:
-    """Codes of `values` for a scale that broadcasts against them."""
-    ratio = np.divide(values, scale, out=np.zeros(values.shape), where=scale > 0)
-    if kind == "float16":
-        return ratio.astype(np.float16)
-    limit = LARGEST_CODE[kind]
-    # The scale was rounded to float32; the largest ratio may pass the limit by that much.
-    return np.clip(np.rint(ratio), -limit, limit).astype(kind)
-
-
-def scale_of(largest: NDArray[np.floating], kind: CodeKind) -> NDArray[np.float32]:
-    """Scale at which the given largest magnitudes get the largest code."""
-    return (largest / LARGEST_CODE[kind]).astype(np.float32)
-
-
-def quantise(
-    values: NDArray[np.floating], kind: CodeKind, *, n_group_axes: int
-) -> QuantisedArray:
-    """Quantise with one scale for each index of the leading axes.
-
-    The error is at most half a step, ``max |group| / 254`` for int8 and
-    ``/ 65534`` for int16; relative 2**-11 for float16.
-
-    Parameters
-    ----------
-    values : (...) float
-        Finite numbers.
-    kind : {"int8", "int16", "float16"}
-        Type of a code.
-    n_group_axes : int
-        Leading axes whose indices have scales of their own.
-
-    Returns
-    -------
-    QuantisedArray
-
-    Raises
-    ------
-    InputError
-        If a value is not finite, or `kind` is unknown.
-    """
-    check_kind("kind", kind)
-    array = np.asarray(values, dtype=np.float64)
-    check_finite("values", array)
-    inner = tuple(range(n_group_axes, array.ndim))
-    largest = np.abs(array).max(axis=inner, initial=0.0)
-    scale = scale_of(largest, kind)
-    spread = scale.astype(np.float64).reshape(scale.shape + (1,) * len(inner))
-    return QuantisedArray(encode(array, spread, kind), scale)
+# Half a turn in steps of this fits the codes of a turn.
+SMALLEST_TURN = 1e-4
 
 
 def check_finite(name: str, values: NDArray[np.floating]) -> None:
@@ -139,55 +29,109 @@ def check_finite(name: str, values: NDArray[np.floating]) -> None:
         raise InputError(f"{name}: expected finite numbers, received {bad} that are not")
 
 
-def codes_from_rotations(rotations: NDArray[np.floating]) -> NDArray[np.uint16]:
-    r"""48-bit codes of rotation matrices.
+@numba.njit(cache=True)
+def _rotation_vector(
+    a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.float64]
+) -> None:
+    """Rotation vector of the unit quaternion a times the inverse of b, at most half a turn."""
+    w = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    x = -a[0] * b[1] + a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
+    y = -a[0] * b[2] + a[1] * b[3] + a[2] * b[0] - a[3] * b[1]
+    z = -a[0] * b[3] - a[1] * b[2] + a[2] * b[1] + a[3] * b[0]
+    sign = -1.0 if w < 0.0 else 1.0
+    length = np.sqrt(x * x + y * y + z * z)
+    share = sign * 2.0
+    if length > 1e-12:
+        share = sign * 2.0 * np.arctan2(length, abs(w)) / length
+    out[0], out[1], out[2] = share * x, share * y, share * z
 
-    The largest of the four quaternion components is made positive and left
-    out. A half step of the others is 2.2e-5, and the largest is at least 1/2,
-    so the decoded rotation is off by less than
-    :math:`2\sqrt{12}\cdot 2.2\cdot 10^{-5}` rad = 0.0086 degrees.
+
+@numba.njit(cache=True)
+def _turn_by(q: NDArray[np.float64], vector: NDArray[np.float64]) -> None:
+    """Replace q by the quaternion of a rotation vector times q, of unit length."""
+    angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    share = np.sin(0.5 * angle) / angle if angle > 1e-12 else 0.5
+    w, x, y, z = np.cos(0.5 * angle), share * vector[0], share * vector[1], share * vector[2]
+    a, b, c, d = q[0], q[1], q[2], q[3]
+    q[0] = w * a - x * b - y * c - z * d
+    q[1] = w * b + x * a + y * d - z * c
+    q[2] = w * c - x * d + y * a + z * b
+    q[3] = w * d + x * c - y * b + z * a
+    q /= np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+
+
+@numba.njit(cache=True)
+def _encode_turns(
+    quaternions: NDArray[np.float64], step: float, codes: NDArray[np.int16]
+) -> None:
+    at, vector = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+    for t in range(len(quaternions)):
+        _rotation_vector(quaternions[t], at, vector)
+        for i in range(3):
+            codes[t, i] = np.int16(np.rint(vector[i] / step))
+            vector[i] = codes[t, i] * step
+        _turn_by(at, vector)
+
+
+@numba.njit(cache=True)
+def _decode_turns(
+    codes: NDArray[np.int16], step: float, quaternions: NDArray[np.float64]
+) -> None:
+    at, vector = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+    for t in range(len(codes)):
+        for i in range(3):
+            vector[i] = codes[t, i] * step
+        _turn_by(at, vector)
+        quaternions[t] = at
+
+
+def codes_from_rotations(rotations: NDArray[np.floating], step: float) -> NDArray[np.int16]:
+    r"""Turns from each rotation to the next, as integer rotation vectors.
+
+    Neighbours are alike, so that most codes are small. Each turn starts from the rotation that
+    will be decoded, not from the given one: errors do not add up, and stay below
+    :math:`\sqrt{3}/2` steps.
 
     Parameters
     ----------
     rotations : (n, 3, 3) float
         Proper rotations.
+    step : float
+        Of each entry of a rotation vector, radians; at least 1e-4.
 
     Returns
     -------
-    (n, 3) uint16
-        15 bits of a component each; the top bits of the first two hold the
-        index (w, x, y, z) of the component left out.
+    (n, 3) int16
 
     Raises
     ------
     ShapeError
         If the shape is not (n, 3, 3).
     InputError
-        If a matrix is not a rotation.
+        If a matrix is not a rotation, or the step too small for the codes.
     """
     check_shape("rotations", rotations, (None, 3, 3))
     matrices = np.asarray(rotations, dtype=np.float64)
     check_rotations(matrices)
-    if not len(matrices):
-        return np.zeros((0, 3), np.uint16)
-    quaternion = quaternion_from_matrix(matrices)
-    largest = np.argmax(np.abs(quaternion), axis=1)
-    sign = np.where(np.take_along_axis(quaternion, largest[:, None], 1) < 0, -1.0, 1.0)
-    kept = np.take_along_axis(quaternion * sign, _OTHERS[largest], 1)
-    steps = np.rint(kept / SMALLEST_THREE_BOUND * HALF_RANGE_CODE).astype(np.int64)
-    codes = (steps + HALF_RANGE_CODE).astype(np.uint16)
-    codes[:, 0] |= ((largest >> 1) << 15).astype(np.uint16)
-    codes[:, 1] |= ((largest & 1) << 15).astype(np.uint16)
+    if not SMALLEST_TURN <= step <= 1.0:
+        raise InputError(
+            f"step: expected {SMALLEST_TURN} to 1 radian for a turn's codes, received {step}"
+        )
+    codes = np.zeros((len(matrices), 3), np.int16)
+    if len(matrices):
+        _encode_turns(quaternion_from_matrix(matrices), float(np.float32(step)), codes)
     return codes
 
 
-def rotations_from_codes(codes: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Rotation matrices of 48-bit codes; inverse of `codes_from_rotations`.
+def rotations_from_codes(codes: NDArray[np.int16], step: float) -> NDArray[np.float32]:
+    """Rotation matrices of codes; inverse of `codes_from_rotations`.
 
     Parameters
     ----------
-    codes : (n, 3) uint16
-        Any bits give a rotation.
+    codes : (n, 3) int16
+        Any numbers give rotations.
+    step : float
+        Radians.
 
     Returns
     -------
@@ -200,22 +144,73 @@ def rotations_from_codes(codes: NDArray[np.uint16]) -> NDArray[np.float32]:
 
     Examples
     --------
-    >>> rotations_from_codes(codes_from_rotations(np.eye(3)[None]))[0]
+    >>> rotations_from_codes(codes_from_rotations(np.eye(3)[None], 0.01), 0.01)[0]
     array([[1., 0., 0.],
            [0., 1., 0.],
            [0., 0., 1.]], dtype=float32)
     """
     check_shape("codes", codes, (None, 3))
+    quaternions = np.zeros((len(codes), 4))
     if not len(codes):
         return np.zeros((0, 3, 3), np.float32)
-    largest = (codes[:, 0] >> 15) * 2 + (codes[:, 1] >> 15)
-    steps = (codes & 0x7FFF).astype(np.float64) - HALF_RANGE_CODE
-    kept = steps * (SMALLEST_THREE_BOUND / HALF_RANGE_CODE)
-    left_out = np.sqrt(np.maximum(1.0 - np.sum(kept**2, axis=1), 0.0))
-    quaternion = np.zeros((len(codes), 4))
-    np.put_along_axis(quaternion, _OTHERS[largest], kept, 1)
-    np.put_along_axis(quaternion, largest[:, None].astype(np.int64), left_out[:, None], 1)
-    return matrix_from_quaternion(quaternion).astype(np.float32)
+    _decode_turns(np.ascontiguousarray(codes, np.int16), float(np.float32(step)), quaternions)
+    return matrix_from_quaternion(quaternions).astype(np.float32)
+
+
+def lattice_points(values: NDArray[np.floating], n_steps: int) -> QuantisedBox:
+    """Points as integers of a lattice over their bounding box, one step for all axes.
+
+    Parameters
+    ----------
+    values : (n, d) float
+        Finite.
+    n_steps : int
+        Along the longest side of the box, at most 65535.
+
+    Returns
+    -------
+    QuantisedBox
+
+    Raises
+    ------
+    InputError
+        If a value is not finite.
+
+    Examples
+    --------
+    >>> box = lattice_points(np.array([[0.0, 5.0], [2.0, 5.5]]), 200)
+    >>> box.codes.tolist(), box.decode().tolist()
+    ([[0, 0], [200, 50]], [[0.0, 5.0], [2.0, 5.5]])
+    """
+    array = np.asarray(values, dtype=np.float64)
+    check_finite("values", array)
+    low = array.min(axis=0, initial=np.inf) if len(array) else np.zeros(array.shape[1])
+    size = float((array - low).max(initial=0.0))
+    step = np.float32(size / n_steps) if size > 0 else np.float32(1.0)
+    low = low.astype(np.float32)
+    ratio = np.rint((array - low.astype(np.float64)) / np.float64(step))
+    codes = np.clip(ratio, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    return QuantisedBox(codes, np.concatenate([low, [step]]).astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class QuantisedBox:
+    """Points as integers of a lattice.
+
+    Parameters
+    ----------
+    codes : (n, d) uint16
+    box : (d + 1,) float32
+        Lowest corner, then the step.
+    """
+
+    codes: NDArray[np.uint16]
+    box: NDArray[np.float32]
+
+    def decode(self) -> NDArray[np.float32]:
+        """Return the points, (n, d) float32."""
+        wide = self.codes.astype(np.float64) * np.float64(self.box[-1])
+        return (wide + self.box[:-1]).astype(np.float32)
 
 
 def check_rotations(matrices: NDArray[np.float64]) -> None:
@@ -237,7 +232,3 @@ def check_rotations(matrices: NDArray[np.float64]) -> None:
             f"frames: expected right-handed orthonormal matrices, received "
             f"{matrices[row].tolist()} in row {row}"
         )
-
-
-# The other three components, in order, for each one left out.
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

@@ -7,14 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.images import encode_srgb
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.model import ReflectanceField
-from reflfield.observations.reading import TexelReader
+from reflfield.observations.projection import facing_irradiance
+from reflfield.observations.reading import LUMINANCE, TexelReader
+
+Floats = NDArray[np.float32]
 
 # Enough for two digits of the error; more only take time.
 MOST_SAMPLES = 500_000
 BLOCK_BYTES = 64 << 20
+# As in comparisons with photographs.
+PSNR_CAP_DB = 100.0
 
 
 @dataclass(frozen=True)
@@ -25,12 +31,16 @@ class SampleError:
     ----------
     linear, cube_root : float
         Of the samples, and of their cube roots, in which dark samples count too.
+    psnr_ldr : float
+        Of the radiance that the samples stand for, sRGB-coded after one exposure, as
+        photographs are compared, dB.
     n_texels, n_samples : int
         Measured on.
     """
 
     linear: float
     cube_root: float
+    psnr_ldr: float
     n_texels: int
     n_samples: int
 
@@ -68,22 +78,46 @@ def sample_error(
     chosen = texels[np.linspace(0, len(texels) - 1, n).astype(np.intp)]
     step = max(1, BLOCK_BYTES // reader.sample_bytes_per_texel)
     blocks = [chosen[first : first + step] for first in range(0, n, step)]
-    total = np.sum([_squares(field, reader, block) for block in blocks], axis=0)
-    linear, cube_root = np.sqrt(total[:2] / np.maximum(total[2:4], 1e-300))
-    return SampleError(float(linear), float(cube_root), n, int(total[4]))
+    parts = [_radiances(field, reader, block) for block in blocks]
+    measured, predicted, irradiance = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
+    return SampleError(
+        linear=_relative(predicted, measured),
+        cube_root=_relative(np.cbrt(predicted), np.cbrt(measured)),
+        psnr_ldr=_psnr_ldr(predicted * irradiance, measured * irradiance),
+        n_texels=n,
+        n_samples=len(measured),
+    )
 
 
-def _squares(
+def _radiances(
     field: ReflectanceField, reader: TexelReader, texels: NDArray[np.intp]
-) -> NDArray[np.float64]:
-    """Squared errors (linear, cube root), squared samples likewise, count of samples."""
+) -> tuple[Floats, Floats, Floats]:
+    """Observed samples of some texels, the field's, and the irradiance they are over."""
     found = reader.measured(texels)
     seen = found.view_seen[:, :, None] & found.light_seen[:, None] & found.pairs
     t, i, j = np.nonzero(seen)
-    measured = found.samples[t, i, j].astype(np.float64)
-    predicted = evaluate(field, texels[t], found.views[t, i], found.lights[t, j])
-    sums = []
-    for a, b in ((predicted, measured), (np.cbrt(predicted), np.cbrt(measured))):
-        sums.append((np.sum((a - b) ** 2), np.sum(b**2)))
-    (rest, size), (rest_root, size_root) = sums
-    return np.array([rest, rest_root, size, size_root, len(t)])
+    irradiance = facing_irradiance(reader.capture.lights, reader.positions[texels])
+    return (
+        found.samples[t, i, j].astype(np.float32),
+        evaluate(field, texels[t], found.views[t, i], found.lights[t, j]),
+        irradiance[t, j],
+    )
+
+
+def _relative(predicted: Floats, measured: Floats) -> float:
+    rest = np.sum(np.square(predicted - measured, dtype=np.float64))
+    size = np.sum(np.square(measured, dtype=np.float64))
+    return float(np.sqrt(rest / max(float(size), 1e-300)))
+
+
+def _psnr_ldr(predicted: Floats, measured: Floats) -> float:
+    white = float(np.percentile(measured @ LUMINANCE, 99.5))
+    exposure = 1.0 / white if white > 0 else 1.0
+    shown = (
+        encode_srgb(np.clip(exposure * values, 0.0, 1.0)) for values in (predicted, measured)
+    )
+    difference = np.subtract(*shown)
+    mean_square = float(np.mean(np.square(difference, dtype=np.float64)))
+    return float(-10.0 * np.log10(max(mean_square, 10.0 ** (-PSNR_CAP_DB / 10.0))))

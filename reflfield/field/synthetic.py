@@ -7,6 +7,7 @@ can be held against a formula.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,26 @@ from reflfield.field.model import (
 from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.sphere.rotations import frames_from_normals
 
+
+@dataclass(frozen=True, eq=False)
+class FramedSurface(BaseSurface):
+    """A surface with the frame of each texel.
+
+    Parameters
+    ----------
+    base_from_world : (n_texels, 3, 3) float64
+        Rows tangent, binormal, normal.
+    """
+
+    base_from_world: NDArray[np.float64]
+
+
 # Reflectance (n_views, n_lights, 3) in 1/sr, without the light's cosine, of local views
 # (n_views, 3) and local lights (n_lights, 3).
 Samples = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
-def square_surface(n_texels: int = 8, size: float = 1.0) -> BaseSurface:
+def square_surface(n_texels: int = 8, size: float = 1.0) -> FramedSurface:
     """Square in the plane z = 0, centred at the origin, facing +z.
 
     Parameters
@@ -40,7 +55,7 @@ def square_surface(n_texels: int = 8, size: float = 1.0) -> BaseSurface:
 
     Returns
     -------
-    BaseSurface
+    FramedSurface
         Texture u runs along +x, v along +y.
 
     Examples
@@ -50,7 +65,7 @@ def square_surface(n_texels: int = 8, size: float = 1.0) -> BaseSurface:
     """
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     positions = np.concatenate([(uv - 0.5) * size, np.zeros((4, 1))], axis=1)
-    return BaseSurface(
+    return FramedSurface(
         positions=positions,
         faces=np.array([[0, 1, 2], [0, 2, 3]]),
         uv=uv,
@@ -59,7 +74,7 @@ def square_surface(n_texels: int = 8, size: float = 1.0) -> BaseSurface:
     )
 
 
-def sphere_surface(height: int = 32, radius: float = 1.0) -> BaseSurface:
+def sphere_surface(height: int = 32, radius: float = 1.0) -> FramedSurface:
     """Sphere at the origin with a latitude-longitude texture.
 
     Parameters
@@ -71,7 +86,7 @@ def sphere_surface(height: int = 32, radius: float = 1.0) -> BaseSurface:
 
     Returns
     -------
-    BaseSurface
+    FramedSurface
         Row 0 at the +z pole; column 0 starts at azimuth 0 and columns follow it.
         The mesh has a vertex at every texel corner.
 
@@ -96,7 +111,7 @@ def sphere_surface(height: int = 32, radius: float = 1.0) -> BaseSurface:
     normals = _on_sphere(column / width, 1 - row / height)
     azimuth = 2 * np.pi * column / width
     tangents = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=1)
-    return BaseSurface(
+    return FramedSurface(
         positions=radius * _on_sphere(u.ravel(), v.ravel()),
         faces=np.concatenate([f.reshape(-1, 3) for f in faces]),
         uv=np.stack([u.ravel(), v.ravel()], axis=1),
@@ -142,7 +157,7 @@ def blinn_phong(albedo: Any, specular: Any, exponent: float) -> Samples:
 
 
 def baked_field(
-    surface: BaseSurface,
+    surface: FramedSurface,
     samples: Samples,
     *,
     view_side: int = 9,
@@ -154,7 +169,7 @@ def baked_field(
 
     Parameters
     ----------
-    surface : BaseSurface
+    surface : FramedSurface
         Where it goes.
     samples : callable
         Reflectance for local views and lights, as `lambert` makes.

@@ -146,7 +146,7 @@ def frame_scores(
     target = job.result("alignment", "alignment.npz")["cluster"][seen]
     return (
         frame_errors(position, field.local_from_world[seen], surface, reach, target),
-        frame_errors(position, field.base_from_world[seen], surface, reach, 0 * target),
+        frame_errors(position, job.texels.local_from_world[seen], surface, reach, 0 * target),
     )
 
 

@@ -239,7 +239,7 @@ def _surface_sections(
         texels.texel_of_pixel, job.view_seen.sum(axis=1), job.observed.lights.sum(axis=1)
     )
     yield sections.normals_section(
-        texels.texel_of_pixel, field.local_from_world, field.base_from_world
+        texels.texel_of_pixel, field.local_from_world, texels.local_from_world
     )
 
 

@@ -23,7 +23,7 @@ from reflfield.alignment.splines import NodeTargets
 from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
 from reflfield.field.compression import cluster_completed, fill_unobserved
-from reflfield.field.file import write_field
+from reflfield.field.file import open_field, write_field
 from reflfield.field.fit import (
     ClusteredModel,
     SampleFitOptions,
@@ -31,12 +31,6 @@ from reflfield.field.fit import (
     solve_coefficients,
 )
 from reflfield.field.frames import improved_block as turned
-from reflfield.field.model import (
-    BaseSurface,
-    FittedReflectance,
-    ReflectanceField,
-    build_field,
-)
 from reflfield.field.residual import sample_error
 from reflfield.observations.projection import Projection, project_photographs
 from reflfield.observations.reading import LUMINANCE, TexelReader
@@ -44,11 +38,12 @@ from reflfield.observations.resampling import unroot
 from reflfield.scheduling import Blocks
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
-from reflfield.stages import plain, versions
+from reflfield.stages import plain
 from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
 from reflfield.steps.job import Job
 from reflfield.steps.memory import columns_at_once, writers_at_once
 from reflfield.steps.options import AlignmentOptions
+from reflfield.steps.quantising import FieldMaker
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -391,16 +386,26 @@ def write_compression(job: Job, folder: Path) -> dict[str, Any]:
     """Raw samples in the aligned frames -> clusters, mean, basis, coefficients -> field."""
     stored = job.result("alignment", "alignment.npz")
     frames = AlignedFrames(stored["local_from_base"], np.flatnonzero(stored["aligned"]))
-    return write_compressed(job, frames, plain(job.options), folder)
+    return write_compressed(
+        frames, FieldMaker(job, job.options.compression, plain(job.options)), folder
+    )
 
 
 def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
-    """The same in the base frames: as many clusters, components and bits."""
+    """The same in the base frames: as many clusters and components, and a file as large."""
     base = np.tile(np.eye(3), (job.base_reader.n_texels, 1, 1))
     frames = AlignedFrames(base, np.zeros(0, np.intp))
     made_with = plain(replace(job.options, alignment=AlignmentOptions(enabled=False)))
     del made_with["completion"]
-    return write_compressed(job, frames, made_with, folder)
+    aligned_field = open_field(job.stages.root / "compression" / "field.rfld")
+    alike = replace(
+        job.options.compression,
+        n_clusters=aligned_field.n_clusters,
+        n_components=aligned_field.n_components,
+        size=(job.stages.root / "compression" / "field.rfld").stat().st_size,
+        psnr=0.0,
+    )
+    return write_compressed(frames, FieldMaker(job, alike, made_with), folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,14 +423,13 @@ class AlignedFrames:
     free: Indices
 
 
-def write_compressed(
-    job: Job, frames: AlignedFrames, made_with: dict[str, Any], folder: Path
-) -> dict[str, Any]:
+def write_compressed(frames: AlignedFrames, maker: FieldMaker, folder: Path) -> dict[str, Any]:
     """Fit a field in the given frames, write it, and measure it on the samples."""
-    model, reader = fitted_model(job, frames, job.blocks(folder))
-    made = field_of(job, model, reader.local_from_world, made_with)
+    job = maker.job
+    model, reader = fitted_model(maker, frames, job.blocks(folder))
+    made = maker.made(model, reader.local_from_world)
     write_field(folder / "field.rfld", made)
-    np.savez(folder / "model.npz", residuals=np.array(model.residuals))
+    write_model(folder / "model.npz", model, reader.local_from_world)
     size = (folder / "field.rfld").stat().st_size
     raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
     error = sample_error(made, job.base_reader, job.seen_texels)
@@ -439,9 +443,10 @@ def write_compressed(
         "field bytes": size,
         "raw bytes": raw,
         "compression ratio": raw / size,
-        "residual in the domain": float(model.residuals[-1]) if model.residuals else None,
+        "residual in the domain": float(model.residuals[-1]),
         "relative error of the samples": error.linear,
         "relative error of their cube roots": error.cube_root,
+        "LDR PSNR of the samples, dB": error.psnr_ldr,
         "samples measured": error.n_samples,
     }
 
@@ -451,11 +456,19 @@ def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
     return (local_from_base @ job.texels.local_from_world).astype(np.float32)
 
 
+def write_model(path: Path, model: ClusteredModel, frames: Floats) -> None:
+    """Store a model before it is quantised, and its frames."""
+    arrays: dict[str, Any] = {
+        entry.name: np.asarray(getattr(model, entry.name)) for entry in fields(model)
+    }
+    np.savez(path, local_from_world=frames, **arrays)
+
+
 def fitted_model(
-    job: Job, frames: AlignedFrames, blocks: Blocks
+    maker: FieldMaker, frames: AlignedFrames, blocks: Blocks
 ) -> tuple[ClusteredModel, TexelReader]:
     """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
-    options = job.options.compression
+    job, options = maker.job, maker.options
     seen = job.seen_texels
     reader = job.base_reader.rotated(local_frames(job, frames.local_from_base))
     found, coefficients = completed(
@@ -468,6 +481,8 @@ def fitted_model(
         blocks=blocks,
     )
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
+    if maker.searches:
+        options = maker.chosen(found, coefficients, reader.local_from_world, counts)
     model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)
     if options.fits_samples(job.observed.count() / len(seen)):
         model, reader = _fitted_to_samples(job, model, reader, frames.free, blocks)
@@ -481,6 +496,7 @@ def _fitted_to_samples(
     options = job.options.compression.samples
     spread = np.radians(options.frame_spread_deg)
     parts = options.halves() if len(free) and spread > 0 else (options,)
+    model = replace(model, residuals=())
     for i, part in enumerate(parts):
         if i > 0:
             better = blocks.map(
@@ -560,49 +576,3 @@ def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]
             context.reader.rooted(texels), context.model.cluster[texels], context.model, pool
         )
     return {"coefficients": found}
-
-
-def field_of(
-    job: Job, model: ClusteredModel, frames: Floats, made_with: dict[str, Any]
-) -> ReflectanceField:
-    """Quantise the model on the base surface into a field."""
-    atlas, texels = job.surface_atlas, job.texels
-    surface = BaseSurface(
-        positions=atlas.positions,
-        faces=atlas.faces,
-        uv=atlas.uv,
-        texel_of_pixel=texels.texel_of_pixel,
-        base_from_world=texels.local_from_world,
-    )
-    reflectance = FittedReflectance(
-        local_from_world=frames,
-        cluster=model.cluster,
-        coefficients=model.coefficients,
-        mean=model.mean,
-        basis=model.basis,
-        domain=job.options.resampling.domain,  # type: ignore[arg-type]
-    )
-    return build_field(
-        surface,
-        reflectance,
-        visibility=job.visibility_kind,  # type: ignore[arg-type]
-        light_model="known" if job.training.lights_known else "unknown",
-        metadata=field_metadata(job, made_with),
-        quantisation=job.options.compression.quantisation,
-    )
-
-
-def field_metadata(job: Job, made_with: dict[str, Any]) -> dict[str, Any]:
-    """What a field says of its making: nothing that a change would not make again."""
-    later = ("relighting", "comparison")
-    options = {name: value for name, value in made_with.items() if name not in later}
-    return {
-        "capture": job.capture.name,
-        "up": job.capture.up.tolist(),
-        "views": job.training.n_views,
-        "lights": job.training.n_lights,
-        "photographs": len(job.training.photographs),
-        "held_out": {"views": job.hold_out.views, "lights": job.hold_out.lights},
-        "options": options,
-        "versions": versions(),
-    }

@@ -18,7 +18,6 @@ def random_parts(rng, *, n_texels=60, n_clusters=3, n_components=4, view_side=4,
         faces=rng.integers(0, 5, size=(7, 3)),
         uv=rng.random((5, 2)),
         texel_of_pixel=texel_of_pixel,
-        base_from_world=frames[::-1],
     )
     nodes = (view_side**2, light_side**2, 3)
     reflectance = FittedReflectance(

@@ -6,44 +6,38 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.model import Quantisation, build_field
+from reflfield.field.model import Quantisation, build_field, neighbours_in_a_row
 from reflfield.field.quantisation import (
     codes_from_rotations,
-    quantise,
+    lattice_points,
     rotations_from_codes,
 )
+from reflfield.field.transform import factor_table, lattice_codes, unfactor_table
 from reflfield.sphere.rotations import matrix_from_quaternion, rotation_angle
 
-HALF_STEP = {"int8": 1 / 254, "int16": 1 / 65534, "float16": 2.0**-11}
 
-
-@pytest.mark.parametrize("kind", ["int8", "int16", "float16"])
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
-def test_error_is_within_half_a_step_of_each_group(kind, scale, rng):
-    values = rng.normal(size=(3, 2, 50)) * scale * np.array([1.0, 1e3, 1e-3])[:, None, None]
-    decoded = quantise(values, kind, n_group_axes=2).decode()
-    largest = np.abs(values).max(axis=2, keepdims=True)
-    # The scale itself is rounded to float32: 2**-23 of the value on top.
-    assert (np.abs(decoded - values) <= largest * (HALF_STEP[kind] + 2.0**-22)).all()
+def test_lattice_is_half_a_step_off_at_most(scale, rng):
+    points = rng.normal(size=(50, 3)) * scale * np.array([1.0, 0.1, 3.0])
+    box = lattice_points(points, 1000)
+    step = np.ptp(points, axis=0).max() / 1000
+    # Corner, step and result are rounded to float32.
+    slack = 4 * np.finfo(np.float32).eps * np.abs(points).max()
+    assert np.abs(box.decode() - points).max() <= 0.5 * step + slack + 1000 * slack
 
 
-def test_zero_stays_zero_and_signs_are_symmetric(rng):
-    values = np.concatenate([np.zeros(3), [1.0, -1.0, 0.3, -0.3]])[None]
-    decoded = quantise(values, "int8", n_group_axes=1).decode()[0]
-    assert not decoded[:3].any()
-    assert np.array_equal(decoded[3::2], -decoded[4::2])
-    assert not quantise(np.zeros((2, 4)), "int8", n_group_axes=1).decode().any()
-
-
-def test_rotations_survive_within_the_stated_angle(rng):
+@pytest.mark.parametrize("step", [1e-4, 0.01, 0.2])
+def test_rotations_survive_within_the_stated_angle(step, rng):
     frames = matrix_from_quaternion(rng.normal(size=(20_000, 4)))
-    decoded = rotations_from_codes(codes_from_rotations(frames)).astype(float)
-    off = np.rad2deg(rotation_angle(decoded @ np.swapaxes(frames, 1, 2)))
-    assert off.max() < 0.0087
+    decoded = rotations_from_codes(codes_from_rotations(frames, step), step).astype(float)
+    off = rotation_angle(decoded @ np.swapaxes(frames, 1, 2))
+    # Half a step about each axis; errors of one texel do not reach the next.
+    assert off.max() <= np.sqrt(3) / 2 * step + 1e-6
     # Not zero either: the bound is approached, so the test sees the codes at work.
-    assert off.max() > 0.004
+    assert off.max() > 0.6 * step
 
 
 @given(st.tuples(*[st.sampled_from([-1.0, -0.5, 0.0, 1e-5, 0.5, 1.0])] * 4))
@@ -51,36 +45,109 @@ def test_rotations_with_ties_and_half_turns_survive(quaternion):
     if not any(quaternion):
         quaternion = (1.0, 0.0, 0.0, 0.0)
     frame = matrix_from_quaternion([quaternion])
-    decoded = rotations_from_codes(codes_from_rotations(frame)).astype(float)
-    assert np.rad2deg(rotation_angle(decoded @ np.swapaxes(frame, 1, 2)))[0] < 0.0087
+    decoded = rotations_from_codes(codes_from_rotations(frame, 1e-4), 1e-4).astype(float)
+    assert rotation_angle(decoded @ np.swapaxes(frame, 1, 2))[0] < 1e-4
+
+
+def test_alike_frames_have_small_codes(rng):
+    vectors = 0.01 * rng.normal(size=(500, 3))
+    frames = Rotation.from_rotvec(vectors).as_matrix()
+    assert np.abs(codes_from_rotations(frames, 0.001)).max() < 100
 
 
 def test_mirrored_frames_are_refused():
     with pytest.raises(InputError, match="frames: expected right-handed"):
-        codes_from_rotations(np.diag([1.0, 1.0, -1.0])[None])
+        codes_from_rotations(np.diag([1.0, 1.0, -1.0])[None], 0.1)
     with pytest.raises(InputError, match="frames: expected right-handed"):
-        codes_from_rotations(np.full((1, 3, 3), np.nan))
+        codes_from_rotations(np.full((1, 3, 3), np.nan), 0.1)
 
 
-@pytest.mark.parametrize("kind", ["int8", "int16", "float16"])
-def test_parts_survive_quantisation(kind, parts):
+def test_too_fine_turns_are_refused():
+    with pytest.raises(InputError, match=r"step: expected 0.0001 to 1 radian"):
+        codes_from_rotations(np.eye(3)[None], 1e-6)
+
+
+def functions_of(reflectance):
+    table = np.concatenate([reflectance.mean[:, None], reflectance.basis], axis=1)
+    ones = np.ones((len(reflectance.cluster), 1))
+    factors = np.concatenate([ones, reflectance.coefficients], axis=1)
+    return np.einsum("tf,tfvlc->tvlc", factors, table[reflectance.cluster])
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3, 1e-2, 1e-1])
+def test_texels_survive_quantisation_as_well_as_the_step_says(step, parts):
     surface, fitted = parts
-    field = build_field(surface, fitted, quantisation=Quantisation(kind, kind, kind))
-    for name in ("mean", "basis", "coefficients"):
-        wanted = getattr(fitted, name)
-        largest = np.abs(wanted).max()
-        assert np.abs(getattr(field, name) - wanted).max() <= 1.01 * HALF_STEP[kind] * largest
+    field = build_field(surface, fitted, quantisation=Quantisation(step))
+    error = functions_of(field) - functions_of(fitted)
+    # Four coefficients a texel, and the numbers of the functions that its cluster shares.
+    n_numbers = 4 + fitted.mean[0].size * 5 * 3 / 60
+    wanted = (step or 2e-5) * np.sqrt(n_numbers / 12)
+    assert np.sqrt(np.mean(error**2)) < 1.5 * wanted
+    assert step == 0 or np.sqrt(np.mean(error**2)) > 0.2 * wanted
     assert np.array_equal(field.cluster, fitted.cluster)
     assert np.array_equal(field.texel_of_pixel, surface.texel_of_pixel)
     assert (field.view_side, field.light_side) == (4, 3)
 
 
-def test_every_cluster_has_its_own_coefficient_scale(parts):
+def test_coarser_steps_give_smaller_codes(parts):
+    fine, coarse = (build_field(*parts, quantisation=Quantisation(s)) for s in (1e-3, 0.3))
+    for name in ("core", "coefficients"):
+        assert np.abs(coarse.arrays[name]).max() < np.abs(fine.arrays[name]).max() / 30
+
+
+def test_shared_functions_need_few_directions(parts, rng):
+    """Six clusters' functions made of two profiles each way: that many factors are kept."""
+    weights = rng.normal(size=(6, 5, 2, 2, 3))
+    view, light = rng.normal(size=(16, 2)), rng.normal(size=(9, 2))
+    table = np.einsum("cfabk,va,lb->cfvlk", weights, view, light)
+    arrays = factor_table(table, np.full((6, 5), 10.0), 1e-4)
+    assert (arrays["view_factor"].shape[1], arrays["light_factor"].shape[1]) == (2, 2)
+    assert arrays["core"].shape[0] <= 12
+    np.testing.assert_allclose(unfactor_table(arrays), table, atol=2e-3)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_unit_of_the_data_does_not_matter(scale, parts):
     surface, fitted = parts
-    loud = np.where((fitted.cluster == 1)[:, None], 1e6, 1.0) * fitted.coefficients
-    field = build_field(surface, replace(fitted, coefficients=loud))
-    quiet = fitted.cluster != 1
-    assert np.abs(field.coefficients - loud)[quiet].max() < 1e-4  # 3.5 sigma / 65534
+    large = replace(fitted, mean=scale * fitted.mean, basis=scale * fitted.basis)
+    field = build_field(surface, large)
+    error = functions_of(field) - functions_of(large)
+    assert np.abs(error).max() < 1e-3 * np.abs(functions_of(large)).max()
+
+
+@pytest.mark.stability
+def test_equal_and_empty_functions_are_left_out(rng):
+    functions = rng.normal(size=(3, 40))
+    dependent = np.concatenate([functions, functions[:1], np.zeros((1, 40))]) / np.sqrt(40)
+    wanted = rng.normal(size=(30, 5)) @ dependent
+    gram = dependent @ dependent.T
+    codes, scale = lattice_codes(wanted @ dependent.T, gram, 1e-3)
+    assert scale[4] == 0
+    assert np.isfinite(scale).all()
+    error = (codes * scale) @ dependent - wanted
+    assert np.sqrt((error**2).sum(axis=1)).max() < 5e-3
+
+
+def test_rounding_is_made_up_for_by_the_other_coefficients(rng):
+    functions = rng.normal(size=(6, 200)) / np.sqrt(200)
+    functions[1:] += 2.0 * functions[:1]  # far from orthogonal
+    wanted, gram = rng.normal(size=(500, 6)) @ functions, functions @ functions.T
+    codes, scale = lattice_codes(wanted @ functions.T, gram, 0.1)
+    fed_back = (codes * scale) @ functions - wanted
+    alone = np.linalg.solve(gram, (wanted @ functions.T).T).T
+    alone = np.rint(alone / scale) * scale @ functions - wanted
+    assert np.sum(fed_back**2) < 0.5 * np.sum(alone**2)
+
+
+def test_vertices_follow_their_triangles(rng):
+    faces = rng.integers(0, 30, size=(40, 3))
+    vertices, renumbered = neighbours_in_a_row(faces, 32)
+    assert np.array_equal(np.sort(vertices), np.arange(32))
+    before, after = ({tuple(f) for f in which} for which in (faces, vertices[renumbered]))
+    assert before == after
+    used = renumbered.ravel()
+    assert np.all(used <= np.concatenate([[0], np.maximum.accumulate(used)[:-1] + 1]))
 
 
 def test_node_table_holds_mean_then_basis(make_field):
@@ -98,7 +165,11 @@ def test_node_table_holds_mean_then_basis(make_field):
         ("coefficients", np.zeros((60, 5)), r"coefficients: expected shape \(60, 4\)"),
         ("coefficients", np.full((60, 4), np.nan), "coefficients: expected finite"),
         ("mean", np.zeros((3, 15, 9, 3)), "basis: expected shape"),
-        ("local_from_world", np.tile(np.eye(3), (59, 1, 1)), "local_frames: expected shape"),
+        (
+            "local_from_world",
+            np.tile(np.eye(3), (59, 1, 1)),
+            "local_from_world: expected shape",
+        ),
         ("domain", "logarithm", "domain: expected one of"),
     ],
 )
@@ -114,7 +185,7 @@ def test_bad_reflectance_is_refused(part, value, text, parts):
         ("texel_of_pixel", np.array([[60]]), "texel_of_pixel: expected indices from -1 to 59"),
         ("faces", np.array([[0, 1, 5]]), "faces: expected indices from 0 to 4"),
         ("uv", np.full((5, 2), np.inf), "uv: expected finite"),
-        ("positions", np.zeros((6, 3)), r"uv: expected shape \(n_vertices = 6, 2\)"),
+        ("positions", np.zeros((6, 3)), r"uv: expected shape \(6, 2\)"),
     ],
 )
 def test_bad_surfaces_are_refused(part, value, text, parts):
@@ -133,7 +204,7 @@ def test_node_counts_must_be_squares(parts):
 
 
 def test_unknown_options_are_refused(parts):
-    with pytest.raises(InputError, match=r"quantisation\.basis"):
-        Quantisation(basis="int4")
+    with pytest.raises(InputError, match=r"quantisation\.step: expected >= 0"):
+        Quantisation(step=-1.0)
     with pytest.raises(InputError, match="visibility"):
         build_field(*parts, visibility="sometimes")

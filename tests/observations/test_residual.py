@@ -43,7 +43,7 @@ def reader_of(field, tmp_path, rng):
             store=ObservationStore(tmp_path / "store", seen),
             capture=capture,
             positions=positions,
-            local_from_world=field.base_from_world,
+            local_from_world=field.local_from_world,
             sides=(5, 5),
             options=ResamplingOptions(),
         )

@@ -7,8 +7,13 @@ from reflfield.capture.images import write_exr
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError, InputError, ShapeError
-from reflfield.field.model import BaseSurface
-from reflfield.field.synthetic import baked_field, lambert, sphere_surface, square_surface
+from reflfield.field.synthetic import (
+    FramedSurface,
+    baked_field,
+    lambert,
+    sphere_surface,
+    square_surface,
+)
 from reflfield.geometry.mesh import read_ply
 from reflfield.relighting.environment import EnvironmentMap, direction_from_uv
 from reflfield.relighting.exposure import luminance
@@ -59,7 +64,7 @@ def test_a_bright_pixel_lights_the_side_it_should(convention):
         (camera,) = orbit_cameras(field.positions, OrbitOptions(n_frames=1, size=1, up=axis))
         sources = renderer._sources(EnvironmentMap(radiance, convention))
         values = sources[0].radiance(camera, np.arange(field.n_texels, dtype=np.int32))[:, 0]
-        brightest = field.base_from_world[np.argmax(values), 2]
+        brightest = field.local_from_world[np.argmax(values), 2]
         assert brightest @ axis > 0.95
 
 
@@ -222,7 +227,7 @@ def face_surface(mesh):
     speck = np.array([[-1, -1], [1, -1], [0, 1]]) * 0.01 / width
     texel_of_pixel = np.full(width**2, -1)
     texel_of_pixel[:n] = np.arange(n)
-    return BaseSurface(
+    return FramedSurface(
         positions=mesh.corners.reshape(-1, 3),
         faces=np.arange(3 * n).reshape(n, 3),
         uv=(centre[:, None] + speck).reshape(-1, 2),

@@ -9,8 +9,9 @@ from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate, texel_taps
-from reflfield.field.model import BaseSurface, FittedReflectance, build_field
+from reflfield.field.model import FittedReflectance, build_field
 from reflfield.field.synthetic import (
+    FramedSurface,
     baked_field,
     blinn_phong,
     lambert,
@@ -248,7 +249,7 @@ def two_squares(visibility):
     floor, roof = square_surface(1, 2.0), square_surface(1, 0.6)
     texture = np.zeros((8, 16), int)
     texture[:, 8:] = 1
-    surface = BaseSurface(
+    surface = FramedSurface(
         positions=np.concatenate([floor.positions, np.add(roof.positions, [0, 0, 1.0])]),
         faces=np.concatenate([floor.faces, roof.faces + 4]),
         uv=np.concatenate([floor.uv * [0.5, 1], roof.uv * [0.5, 1] + [0.5, 0]]),

@@ -1,0 +1,164 @@
+"""From a fitted model to a field of the size, or the quality, that was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.factorization import Completion
+from reflfield.field.compression import CompressionOptions, cluster_completed
+from reflfield.field.file import PackedSizes
+from reflfield.field.fit import ClusteredModel
+from reflfield.field.model import (
+    BaseSurface,
+    FittedReflectance,
+    Quantisation,
+    ReflectanceField,
+    build_field,
+    quantisation_error,
+)
+from reflfield.field.rate import field_of_quality, field_of_size
+from reflfield.field.residual import sample_error
+from reflfield.progress import track
+from reflfield.stages import versions
+from reflfield.steps.job import Job
+
+Floats = NDArray[np.float32]
+
+# Clusters that are tried where a size or a quality is asked for, and components of each.
+CLUSTERS_TRIED = (1, 2, 4, 8, 16)
+COMPONENTS_TRIED = 10
+# Samples that the search for a quality looks at; the result is measured on more.
+SAMPLES_MEASURED = 100_000
+# A field found for a quality is taken to reach it within this.
+CLOSE_DB = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMaker:
+    """Fields of one run: what they have in common.
+
+    Parameters
+    ----------
+    job : Job
+    options : CompressionOptions
+    made_with : dict
+        All options, for the metadata.
+    """
+
+    job: Job
+    options: CompressionOptions
+    made_with: dict[str, Any]
+
+    @property
+    def searches(self) -> bool:
+        """Whether clusters and components are chosen by size or quality."""
+        asked = self.job.options.compression
+        return self.options is asked and (asked.size > 0 or asked.psnr > 0)
+
+    def fitted(self, model: ClusteredModel, frames: Floats) -> FittedReflectance:
+        """Model and frames as a field takes them."""
+        return FittedReflectance(
+            local_from_world=frames,
+            cluster=model.cluster,
+            coefficients=model.coefficients,
+            mean=model.mean,
+            basis=model.basis,
+            domain=self.job.options.resampling.domain,  # type: ignore[arg-type]
+        )
+
+    def build(self, model: ClusteredModel, frames: Floats, step: float) -> ReflectanceField:
+        """Quantise the model on the base surface into a field."""
+        job, atlas = self.job, self.job.surface_atlas
+        surface = BaseSurface(
+            positions=atlas.positions,
+            faces=atlas.faces,
+            uv=atlas.uv,
+            texel_of_pixel=job.texels.texel_of_pixel,
+        )
+        return build_field(
+            surface,
+            self.fitted(model, frames),
+            visibility=job.visibility_kind,  # type: ignore[arg-type]
+            light_model="known" if job.training.lights_known else "unknown",
+            metadata=field_metadata(job, self.made_with),
+            quantisation=Quantisation(step),
+        )
+
+    def made(self, model: ClusteredModel, frames: Floats) -> ReflectanceField:
+        """Field of the size, the quality or the coarseness that was asked for."""
+        options = self.options
+        step = options.coarseness * model.residuals[-1]
+
+        def build(at: float) -> ReflectanceField:
+            return self.build(model, frames, at)
+
+        if options.size:
+            return field_of_size(build, step, options.size)
+        if options.psnr:
+            return field_of_quality(build, self.quality, step, options.psnr)
+        return build(step)
+
+    def quality(self, field: ReflectanceField) -> float:
+        """LDR PSNR on the samples, dB."""
+        job = self.job
+        found = sample_error(field, job.base_reader, job.seen_texels, SAMPLES_MEASURED)
+        return found.psnr_ldr
+
+    def chosen(
+        self, found: Completion, coefficients: Floats, frames: Floats, counts: tuple[int, int]
+    ) -> CompressionOptions:
+        """Clusters and components with which completed texels make the best field.
+
+        The best of a size has the least error; of a quality, the fewest bytes.
+        """
+        seen, options = self.job.seen_texels, self.options
+        tried = [n for n in CLUSTERS_TRIED if n == 1 or n * COMPONENTS_TRIED <= len(seen)]
+        candidates = []
+        for n in track(tried, len(tried), "clusters for the size"):
+            wanted = replace(options, n_clusters=n, n_components=COMPONENTS_TRIED)
+            model = cluster_completed(
+                found, coefficients, seen, counts, wanted, self.job.options.seed
+            )
+            field = self.made(model, frames)
+            candidates.append((self._cost(field, model, frames), n, components_used(field)))
+        _, n_clusters, n_components = min(candidates)
+        return replace(options, n_clusters=n_clusters, n_components=n_components)
+
+    def _cost(self, field: ReflectanceField, model: ClusteredModel, frames: Floats) -> float:
+        """What is to be least: the error, or the bytes; in dB below the goal if missed."""
+        options = self.options
+        if options.size:
+            added = quantisation_error(self.fitted(model, frames), field)
+            return float(np.hypot(model.residuals[-1], added))
+        missing = options.psnr - self.quality(field)
+        # Bytes count only where the quality is reached.
+        return float(PackedSizes().of(field)) if missing <= CLOSE_DB else 1e12 * (1 + missing)
+
+
+def components_used(field: ReflectanceField) -> int:
+    """Components that have a coefficient other than zero.
+
+    Components are sorted by what they explain.
+    """
+    used = np.flatnonzero(np.any(field.arrays["coefficients"] != 0, axis=0))
+    return int(used[-1]) + 1 if len(used) else 0
+
+
+def field_metadata(job: Job, made_with: dict[str, Any]) -> dict[str, Any]:
+    """What a field says of its making: nothing that a change would not make again."""
+    later = ("relighting", "comparison")
+    options = {name: value for name, value in made_with.items() if name not in later}
+    return {
+        "capture": job.capture.name,
+        "up": job.capture.up.tolist(),
+        "views": job.training.n_views,
+        "lights": job.training.n_lights,
+        "photographs": len(job.training.photographs),
+        "held_out": {"views": job.hold_out.views, "lights": job.hold_out.lights},
+        "options": options,
+        "versions": versions(),
+    }
