@@ -29,7 +29,6 @@ from reflfield.factorization.sources import (
     shuffled_columns,
 )
 from reflfield.factorization.start import (
-    LEAST_COVERAGE,
     PSEUDO_OBSERVATIONS,
     start_model,
     unbiased,
@@ -283,7 +282,7 @@ def one_pass(
     for done, columns in enumerate(blocks_of(order, block)):
         report("completion", done * block, len(order))
         data = reader.block(columns)
-        counted = data.coverage >= LEAST_COVERAGE
+        counted = data.coverage >= reader.least_coverage
         statistics.add(data, infer(model, data, gram), counted)
         if online and statistics.count > SOLVING_GROWTH * solved_at:
             solved_at = statistics.count
@@ -328,7 +327,7 @@ def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
         residuals=tuple(residual * scale for residual in fit.residuals),
         coverage=coverage.astype(np.float32),
         empty_columns=coverage == 0,
-        sparse_columns=coverage < LEAST_COVERAGE,
+        sparse_columns=coverage < reader.least_coverage,
         empty_rows=np.repeat(sample_weight == 0, model.n_channels),
         restarts=restarts,
     )

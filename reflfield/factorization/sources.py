@@ -77,6 +77,10 @@ def blocks_of(columns: Columns, size: int) -> Iterator[Columns]:
 
 # --- adapters ---------------------------------------------------------------------------
 
+# A column of which less was seen tells the basis nothing that its noise does not, where others
+# were seen better.
+LEAST_COVERAGE = 0.02
+
 
 @dataclass(frozen=True)
 class ArraySource:
@@ -356,13 +360,15 @@ class Reader:
     """Reads blocks of a source in one precision and one unit.
 
     Values are divided by `scale`, a power of two near the largest of them,
-    so that squares neither underflow nor overflow in float32.
+    so that squares neither underflow nor overflow in float32. Columns of which less than
+    `least_coverage` was seen are completed, but do not shape the basis.
     """
 
     source: ColumnSource
     n_channels: int
     dtype: np.dtype[np.floating]
     scale: float = 1.0
+    least_coverage: float = LEAST_COVERAGE
 
     def block(self, columns: Columns) -> Block:
         """Read columns, zero what is unobserved, check the rest."""
@@ -384,14 +390,24 @@ class Reader:
 
 
 def reader_of(source: ColumnSource, n_channels: int, block: int) -> Reader:
-    """Return a reader whose scale is that of the first columns that are not all zero."""
+    """Return a reader whose scale and least coverage suit the first columns not all zero."""
     reader = Reader(source, n_channels, source_dtype(source))
     for columns in blocks_of(np.arange(source.shape[1]), block):
-        values = reader.block(columns).values
-        largest = float(max(values.max(), -values.min()))
+        data = reader.block(columns)
+        largest = float(max(data.values.max(), -data.values.min()))
         if largest > 0:
-            return replace(reader, scale=float(2.0 ** np.round(np.log2(largest))))
+            return replace(
+                reader,
+                scale=float(2.0 ** np.round(np.log2(largest))),
+                least_coverage=_least_coverage(data.coverage),
+            )
     return reader
+
+
+def _least_coverage(coverage: NDArray[np.float64]) -> float:
+    """Below `LEAST_COVERAGE` where all columns are sparse: some have to shape the basis."""
+    usual = float(np.quantile(coverage[coverage > 0], 0.9))
+    return min(LEAST_COVERAGE, 0.5 * usual)
 
 
 def _check_read(name: str, array: NDArray[Any], expected: tuple[int, int]) -> None:

@@ -29,8 +29,8 @@ from reflfield.factorization.recursive import (
 from reflfield.factorization.sources import Block, Columns, Reader, blocks_of
 
 Array = NDArray[Any]
-# A column of which less was seen tells the basis nothing that its noise does not.
-LEAST_COVERAGE = 0.02
+# Of a block that was observed, in the first guess of its variance.
+LEAST_SHARE = 1e-3
 # What a row weighs while columns stream by, in observations, when it is solved for again.
 PSEUDO_OBSERVATIONS = 2.0
 # The same towards zero, for rows that the start has not fitted yet.
@@ -88,8 +88,8 @@ def start_model(
             best = (*fitted, data)
     if best is None:
         raise InputError(
-            f"observed: expected a column of which {LEAST_COVERAGE:.0%} was observed, received "
-            "none; there is nothing to complete from"
+            f"observed: expected a column of which {reader.least_coverage:.0%} was observed, "
+            "received none; there is nothing to complete from"
         )
     floor, model, posterior, data = best
     return _extended(model, posterior, data), floor
@@ -105,7 +105,7 @@ def _informative_blocks(reader: Reader, order: Columns, block: int) -> list[Bloc
     found: list[Block] = []
     for columns in blocks_of(order, block):
         data = reader.block(columns)
-        kept = data.coverage >= LEAST_COVERAGE
+        kept = data.coverage >= reader.least_coverage
         if kept.any():
             found.append(Block(columns[kept], data.values[:, kept], data.weights[:, kept]))
         if len(found) == TRIALS:
@@ -176,7 +176,7 @@ def _first_model(
         # Another beginning on what may be the same block.
         filled = filled * (0.5 + rng.random((filled.shape[1],))).astype(filled.dtype)
     basis, values = leading_vectors(filled, rank, rng)
-    share = max(float(weights.mean()), LEAST_COVERAGE)
+    share = max(float(weights.mean()), LEAST_SHARE)
     variance = (values.astype(np.float64) / share) ** 2 / filled.shape[1]
     power = float((filled.astype(np.float64) ** 2).sum()) / float(weights.sum())
     prior = floored(np.diag(variance))

@@ -328,3 +328,14 @@ def test_bad_matrices_are_refused():
         complete([np.ones((3, 2))], np.ones((3, 2), bool), rank=1)
     with pytest.raises(InputError, match="at least one block of columns"):
         complete([], rank=1)
+
+
+@pytest.mark.stability
+def test_columns_that_are_all_sparse_shape_the_basis_together(rng):
+    """Of each one in a hundred entries: no column reaches the usual share."""
+    truth = rng.standard_normal((1000, 2)) @ rng.standard_normal((2, 600)) + 3.0
+    observed = rng.random(truth.shape) < 0.012
+    found = complete(truth, observed, rank=3, passes=4, seed=0)
+    assert found.sparse_columns.mean() < 0.2
+    error = (found.reconstruct(np.arange(600)) - truth)[observed]
+    assert np.sqrt(np.mean(error**2)) < 0.3 * np.sqrt(np.mean(truth**2))
