@@ -356,11 +356,11 @@ def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
-        say(f"{record.name:<14}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
+        say(f"{record.name:<18}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
     metrics = job.out / "metrics.json"
     if metrics.is_file() and any(r.name == "report" for r in job.stages.records):
         say_metrics(json.loads(metrics.read_text()))
-    say(f"total         {time.perf_counter() - started:8.1f} s")
+    say(f"total             {time.perf_counter() - started:8.1f} s")
     for name in ("field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
                  "metrics.json", "timings.json", "report/index.html"):  # fmt: skip
         if (job.out / name).is_file():

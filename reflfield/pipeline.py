@@ -16,7 +16,7 @@ from reflfield.capture.model import Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
 from reflfield.stages import only_run
-from reflfield.steps import evaluation, outputs, reflectance, surface
+from reflfield.steps import evaluation, outputs, rate_distortion, reflectance, surface
 from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
@@ -134,8 +134,17 @@ ORDER = (
         options=lambda options: options.relighting,
         reads=lambda job: {n: f.digest() for n, f in evaluation.frame_sets(job).items()},
     ),
+    # what bits bring: the models quantised more and more coarsely
+    Stage(
+        "rate_distortion",
+        rate_distortion.write_rate_distortion,
+        after=("compression", "without_alignment"),
+        options=lambda options: options.relighting,
+        reads=lambda job: {n: f.digest() for n, f in evaluation.frame_sets(job).items()},
+        wanted=lambda options: options.shows_rate_distortion,
+    ),
     # everything that was found, in one page
-    Stage("report", outputs.write_report_page, after=("comparison",)),
+    Stage("report", outputs.write_report_page, after=("comparison", "rate_distortion")),
 )
 STAGES = tuple(stage.name for stage in ORDER)
 BY_NAME = {stage.name: stage for stage in ORDER}

@@ -94,6 +94,10 @@ class PackedSizes:
         _write_archive(buffer, reflectance_field, members)
         return buffer.tell()
 
+    def array_bytes(self, name: str, array: NDArray[Any]) -> int:
+        """Bytes of one array in the file."""
+        return len(self._array(name, array).content)
+
     def _array(self, name: str, array: NDArray[Any]) -> PackedArray:
         described = f"{array.dtype}{array.shape}".encode()
         key = (name, hashlib.sha256(described + array.tobytes()).digest())

@@ -129,9 +129,13 @@ class ComparisonOptions:
         Make a second field in the base frames, with as many clusters, components and bits,
         and report the error of both: what alignment brings. Takes as long again as the
         compression.
+    rate_distortion : bool
+        Quantise the fitted models more and more coarsely, relight the held-out frames from
+        each, and draw quality against size. Always done where a size or quality is asked for.
     """
 
     without_alignment: bool = False
+    rate_distortion: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,6 +164,12 @@ class PipelineOptions:
     def compares_without_alignment(self) -> bool:
         """Whether a second field, in the base frames, is made to compare with."""
         return self.comparison.without_alignment and self.alignment.enabled
+
+    @property
+    def shows_rate_distortion(self) -> bool:
+        """Whether quality is drawn against size."""
+        asked = self.compression.size > 0 or self.compression.psnr > 0
+        return self.comparison.rate_distortion or asked
 
     def __post_init__(self) -> None:
         if self.seed < 0:

@@ -30,6 +30,7 @@ from reflfield.stages import plain, versions
 from reflfield.steps import evaluation
 from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
+from reflfield.steps.rate_distortion import stored_points
 from reflfield.steps.standalone import metrics_text
 
 # Sets of frames that are compared: title and sentence.
@@ -166,6 +167,7 @@ def report_content(
     parts = [
         *_frames_sections(job, compared),
         *_ablation_sections(job, compared),
+        *_rate_sections(job),
         *_surface_sections(job, field, average),
         _alignment_section(job),
         *_truth_sections(job, field, compared.get("truth")),
@@ -290,6 +292,17 @@ def _ablation_sections(job: Job, compared: dict[str, Comparison | None]) -> Iter
         )
         pairs.append(next(iter(evaluation.relit_pairs(job, variant).values()), ()))
     yield sections.ablation_section(variants, pairs)
+
+
+def _rate_sections(job: Job) -> Iterator[Section]:
+    """Quality against size, if the options ask for it."""
+    if not job.options.shows_rate_distortion:
+        return
+    yield sections.rate_distortion_section(
+        stored_points(job),
+        "The last row has the numbers of the fitted model as half floats, unfactored and not "
+        "packed, as the paper stores them.",
+    )
 
 
 def _alignment_section(job: Job) -> Section:

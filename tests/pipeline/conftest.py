@@ -67,6 +67,7 @@ iterations = 2
 samples_per_pixel = 1
 [comparison]
 without_alignment = true
+rate_distortion = true
 """
 HELD_OUT = ("--hold-out", "views=1,lights=1")
 

@@ -152,6 +152,21 @@ class TestWhatARunLeaves:
         # A step of at most a degree about each axis.
         np.testing.assert_allclose(field.local_from_world, base, atol=np.deg2rad(0.9))
 
+    def test_quality_falls_as_files_shrink(self, finished):
+        points = json.loads(
+            (finished.folder / "stages" / "rate_distortion" / "points.json").read_text()
+        )
+        curves = {p["curve"] for p in points}
+        assert {"with alignment", "without alignment"} < curves
+        for name in ("with alignment", "without alignment"):
+            sizes = [p["file_bytes"] for p in points if p["curve"] == name]
+            quality = [p["samples_db"] for p in points if p["curve"] == name]
+            assert sizes == sorted(sizes, reverse=True)
+            # The coarsest is worse than the finest; in between, noise may help by chance.
+            assert quality[-1] < quality[0] - 0.5
+        assert all(p["heldout_db"] > 5 for p in points)
+        assert "Quality against size" in (finished.folder / "report" / "index.html").read_text()
+
     def test_results_on_stdout_and_only_progress_on_stderr(self, finished):
         assert str(finished.folder / "field.rfld") in finished.outcome.out.splitlines()
         assert "PSNR" in finished.outcome.out
@@ -199,10 +214,13 @@ class TestSecondRun:
             STAGES[STAGES.index(first) : STAGES.index(last) + 1]
         )
 
-    def test_alignment_does_not_touch_the_field_without_it(self, run_copy, run_tiny):
+    def test_field_without_alignment_follows_the_size_of_that_with_it(self, run_copy, run_tiny):
         run_tiny(run_copy, "--set", "alignment.iterations=2", "--until", "without_alignment")
         again = [stage for stage, reused in states(run_copy).items() if not reused]
-        assert again == ["alignment", "compression"]
+        assert again == ["alignment", "compression", "without_alignment"]
+        folders = [run_copy / "stages" / name for name in again[1:]]
+        sizes = [(folder / "field.rfld").stat().st_size for folder in folders]
+        assert abs(sizes[0] - sizes[1]) < 0.02 * sizes[0]
 
     def test_frames_are_improved_while_the_field_is_fitted_unless_held(
         self, run_copy, run_tiny
@@ -217,6 +235,33 @@ class TestSecondRun:
         turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         # A prior of one degree keeps most texels within three; quantisation moves them .02.
         assert 0.1 < turned.mean() < 3.0
+
+    def test_field_of_a_size_fits_it_closely(self, run_copy, run_tiny, finished):
+        size = (finished.folder / "field.rfld").stat().st_size + 1500
+        assert (
+            run_tiny(
+                run_copy, "--size", f"{size / 1024:.3f}KB", "--until", "compression"
+            ).status
+            == 0
+        )
+        assert 0.97 * size < (run_copy / "field.rfld").stat().st_size <= size
+
+    def test_field_of_a_quality_reaches_it(self, run_copy, run_tiny, finished):
+        records = json.loads((finished.folder / "timings.json").read_text())["stages"]
+        (made,) = (r["counts"] for r in records if r["name"] == "compression")
+        wanted = made["LDR PSNR of the samples, dB"] - 1.0
+        assert (
+            run_tiny(run_copy, "--psnr", f"{wanted:.2f}", "--until", "compression").status == 0
+        )
+        records = json.loads((run_copy / "timings.json").read_text())["stages"]
+        (found,) = (r["counts"] for r in records if r["name"] == "compression")
+        assert found["LDR PSNR of the samples, dB"] >= wanted - 0.05
+        assert found["field bytes"] < made["field bytes"]
+
+    def test_impossible_sizes_are_refused(self, run_copy, run_tiny):
+        outcome = run_tiny(run_copy, "--size", "1KB", "--until", "compression")
+        assert outcome.status != 0
+        assert "size: expected at least" in outcome.err
 
     def test_without_the_comparison_the_field_is_the_same(self, run_copy, run_tiny, finished):
         off = ("--set", "comparison.without_alignment=false")

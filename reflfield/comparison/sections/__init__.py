@@ -12,6 +12,10 @@ from reflfield.comparison.sections.frames import (
     frames_section,
     metrics_table,
 )
+from reflfield.comparison.sections.rate_distortion import (
+    RatePoint,
+    rate_distortion_section,
+)
 from reflfield.comparison.sections.run import (
     StageRecord,
     compression_section,
@@ -31,6 +35,7 @@ from reflfield.comparison.sections.truth import truth_section
 __all__ = [
     "Account",
     "FieldVariant",
+    "RatePoint",
     "SilhouetteView",
     "StageRecord",
     "ablation_section",
@@ -44,6 +49,7 @@ __all__ = [
     "key_numbers",
     "metrics_table",
     "normals_section",
+    "rate_distortion_section",
     "run_section",
     "silhouettes_section",
     "stages_section",

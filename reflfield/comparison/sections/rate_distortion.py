@@ -6,7 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from reflfield.comparison import plots
-from reflfield.comparison.report import Figure, Note, Panel, Section, Table, format_bytes
+from reflfield.comparison.report import (
+    Figure,
+    Note,
+    Panel,
+    Picture,
+    Section,
+    Table,
+    format_bytes,
+)
 from reflfield.errors import InputError
 
 
@@ -61,11 +69,15 @@ def rate_distortion_section(points: Sequence[RatePoint], note: str = "") -> Sect
         "Each curve is one model, quantised more and more coarsely from right to left.",
         min_width=0,
     )
-    parts = (figure, _table(points), *((Note(note),) if note else ()))
-    return Section("Quality against size", parts)
+    return Section(
+        "Quality against size",
+        "The field at several quantisation steps, of which compression.coarseness, --size or "
+        "--psnr chooses one.",
+        (figure, _table(points), *((Note(note),) if note else ())),
+    )
 
 
-def _plot(points: Sequence[RatePoint], which: str, label: str) -> plots.Picture:
+def _plot(points: Sequence[RatePoint], which: str, label: str) -> Picture:
     series: dict[str, tuple[list[float], list[float]]] = {}
     for point in points:
         value = getattr(point, which)
