@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import io
 import os
+import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
@@ -418,6 +420,34 @@ def _exr_rgb(path: Path) -> Float32:
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
+class _Quiet:
+    """Keeps what is printed from standard output, also where threads overlap.
+
+    `contextlib.redirect_stdout` gives each thread back what it found: of two that overlap, the
+    second found the first one's buffer, and leaves it in place for good.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._outer: TextIO = sys.stdout
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._outer, sys.stdout = sys.stdout, io.StringIO()
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                sys.stdout = self._outer
+
+
+_QUIET = _Quiet()
+
+
 def _exr_channels(path: Path) -> dict[str, Float32]:
     """All channels of the first part, placed in the display window."""
     display, data = _exr_windows(path)
@@ -426,7 +456,7 @@ def _exr_channels(path: Path) -> dict[str, Float32]:
     with (
         _named(path, "an OpenEXR image"),
         # Of a damaged file OpenEXR prints a warning besides failing: the error says it.
-        redirect_stdout(io.StringIO()),
+        _QUIET,
         OpenEXR.File(str(path), separate_channels=True) as file,
     ):
         return {

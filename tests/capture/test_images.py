@@ -1,5 +1,8 @@
 """Image files: what goes in comes out, and damage is named."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import OpenEXR
@@ -284,3 +287,12 @@ def test_failed_write_leaves_nothing(tmp_path):
         killed_while_writing(tmp_path / "keep.txt")
     assert [p.name for p in tmp_path.iterdir()] == ["keep.txt"]
     assert (tmp_path / "keep.txt").read_bytes() == b"old"
+
+
+def test_photographs_read_by_many_threads_leave_standard_output_alone(tmp_path):
+    """Readers that overlap must not leave each other's silence behind."""
+    write_exr(tmp_path / "a.exr", np.ones((64, 64, 3), np.float32))
+    before = sys.stdout
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(read_image, [tmp_path / "a.exr"] * 400))
+    assert sys.stdout is before
