@@ -48,6 +48,7 @@ from reflfield.field.transform import (
     smallest_codes,
     unfactor_table,
 )
+from reflfield.scheduling import one_core_blas
 
 Domain = Literal["cube_root", "square_root", "linear"]
 Visibility = Literal["kept", "factored"]
@@ -262,7 +263,9 @@ class ReflectanceField:
             check_finite(f"{name}_scale", self.arrays[f"{name}_scale"])
         check_finite("function_gain", self.arrays["function_gain"])
         check_finite("colour_factor", self.arrays["colour_factor"])
-        return np.ascontiguousarray(np.moveaxis(unfactor_table(self.arrays), 1, 3))
+        with one_core_blas():
+            table = unfactor_table(self.arrays)
+        return np.ascontiguousarray(np.moveaxis(table, 1, 3))
 
     @property
     def mean(self) -> NDArray[np.float32]:
@@ -362,7 +365,9 @@ def build_field(
     bits = quantisation or Quantisation()
     _check_reflectance(reflectance)
     sides = [node_side("mean", n) for n in reflectance.mean.shape[1:3]]
-    arrays = _surface_arrays(surface) | _reflectance_arrays(reflectance, bits)
+    # Sums of several cores end in other last bits with other numbers of them.
+    with one_core_blas():
+        arrays = _surface_arrays(surface) | _reflectance_arrays(reflectance, bits)
     check_arrays({name: (a.dtype.name, a.shape) for name, a in arrays.items()})
     built = ReflectanceField(
         arrays=arrays,

@@ -183,8 +183,8 @@ def lattice_codes(
     --------
     >>> functions, wanted = np.array([[1.0, 0.0], [0.6, 0.8]]), np.array([[0.25, -0.5]])
     >>> codes, scale = lattice_codes(wanted @ functions.T, functions @ functions.T, 0.1)
-    >>> codes, ((codes * scale) @ functions).round(2)
-    (array([[ 6, -6]], dtype=int32), array([[ 0.24, -0.48]]))
+    >>> codes.tolist(), ((codes * scale) @ functions).round(2).tolist()
+    ([[6, -5]], [[0.23, -0.5]])
     """
     n, k = moments.shape
     codes, scale = np.zeros((n, k), np.int32), np.zeros(k, np.float32)
