@@ -56,7 +56,7 @@ SHINY_AND_DULL = (SIMILAR[0], {"nu": 20.0, "nv": 20.0, "diffuse": 0.4, "specular
 
 @pytest.mark.parametrize(
     "materials",
-    [SIMILAR, SHINY_AND_DULL, FAR_APART],
+    [SIMILAR, SHINY_AND_DULL, pytest.param(FAR_APART, marks=pytest.mark.slow)],
     ids=["similar", "shiny and dull", "far apart"],
 )
 def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene, rng):

@@ -67,7 +67,7 @@ def scene(thing, material, **effects):
     [
         ("sphere", "satin", SMALL),
         ("sphere", "satin", LARGE),
-        ("relief", "greek_key", LARGE),
+        pytest.param("relief", "greek_key", LARGE, marks=pytest.mark.slow),
         ("vase", "gold", LARGE),
     ],
     ids=["small", "ball", "relief", "vase"],
