@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from threadpoolctl import threadpool_limits
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError, ShapeError
@@ -49,6 +48,7 @@ from reflfield.field.transform import (
     smallest_codes,
     unfactor_table,
 )
+from reflfield.scheduling import one_core_blas
 
 Domain = Literal["cube_root", "square_root", "linear"]
 Visibility = Literal["kept", "factored"]
@@ -263,7 +263,7 @@ class ReflectanceField:
             check_finite(f"{name}_scale", self.arrays[f"{name}_scale"])
         check_finite("function_gain", self.arrays["function_gain"])
         check_finite("colour_factor", self.arrays["colour_factor"])
-        with threadpool_limits(limits=1, user_api="blas"):
+        with one_core_blas():
             table = unfactor_table(self.arrays)
         return np.ascontiguousarray(np.moveaxis(table, 1, 3))
 
@@ -366,7 +366,7 @@ def build_field(
     _check_reflectance(reflectance)
     sides = [node_side("mean", n) for n in reflectance.mean.shape[1:3]]
     # Sums of several cores end in other last bits with other numbers of them.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_core_blas():
         arrays = _surface_arrays(surface) | _reflectance_arrays(reflectance, bits)
     check_arrays({name: (a.dtype.name, a.shape) for name, a in arrays.items()})
     built = ReflectanceField(

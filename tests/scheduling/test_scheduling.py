@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from reflfield.errors import InputError
 from reflfield.progress import listening
-from reflfield.scheduling import BlockFiles, Blocks, Scheduler, Tally
+from reflfield.scheduling import BlockFiles, Blocks, Scheduler, Tally, one_core_blas
 
 
 def square(context, block):
@@ -144,3 +145,20 @@ class TestCluster:
         twice = {n for n, _ in begun if sum(other == n for other, _ in begun) > 1}
         assert twice <= {n for n, process in begun if process == lost}
         assert "2" in twice
+
+
+def blas_threads():
+    """Most threads that any BLAS of this process would use."""
+    return max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+
+
+def test_blas_has_its_threads_back_when_holders_of_the_limit_overlap():
+    with threadpool_limits(limits=2, user_api="blas"):
+        first, second = one_core_blas(), one_core_blas()
+        first.__enter__()
+        second.__enter__()
+        assert blas_threads() == 1
+        first.__exit__(None, None, None)
+        assert blas_threads() == 1
+        second.__exit__(None, None, None)
+        assert blas_threads() == 2
