@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.model import Quantisation, build_field, neighbours_in_a_row
+from reflfield.field.model import (
+    Quantisation,
+    build_field,
+    neighbours_in_a_row,
+    quantisation_error,
+)
 from reflfield.field.quantisation import (
     codes_from_rotations,
     lattice_points,
@@ -87,6 +92,16 @@ def test_texels_survive_quantisation_as_well_as_the_step_says(step, parts):
     assert np.array_equal(field.cluster, fitted.cluster)
     assert np.array_equal(field.texel_of_pixel, surface.texel_of_pixel)
     assert (field.view_side, field.light_side) == (4, 3)
+
+
+@pytest.mark.parametrize("step", [1e-3, 0.1])
+def test_quantisation_error_is_that_of_all_nodes(step, parts):
+    """By Gram matrices as by forming every texel's nodes."""
+    surface, fitted = parts
+    field = build_field(surface, fitted, quantisation=Quantisation(step))
+    direct = np.sqrt(np.mean((functions_of(field) - functions_of(fitted)) ** 2))
+    # Squares of size one are subtracted: half the digits of the difference are left.
+    assert quantisation_error(fitted, field) == pytest.approx(direct, rel=1e-4, abs=1e-7)
 
 
 def test_coarser_steps_give_smaller_codes(parts):
