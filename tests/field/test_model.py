@@ -94,6 +94,20 @@ def test_texels_survive_quantisation_as_well_as_the_step_says(step, parts):
     assert (field.view_side, field.light_side) == (4, 3)
 
 
+def test_coefficients_make_up_for_the_rounding_of_the_functions(parts):
+    """What is left along the functions as read is the rounding of coefficients alone."""
+    surface, fitted = parts
+    field = build_field(surface, fitted, quantisation=Quantisation(0.05))
+    n_nodes = fitted.mean[0].size
+    error = (functions_of(field) - functions_of(fitted)).reshape(60, n_nodes)
+    for cluster in range(3):
+        functions = field.basis[cluster].reshape(4, n_nodes).astype(float)
+        along = np.linalg.qr(functions.T)[0]
+        shares = error[fitted.cluster == cluster] @ along / np.sqrt(n_nodes)
+        # Half a step in each direction of the nearest plane; float32 for the rest.
+        assert np.abs(shares).max() <= 0.5 * 0.05 * (1 + 1e-3)
+
+
 @pytest.mark.parametrize("step", [1e-3, 0.1])
 def test_quantisation_error_is_that_of_all_nodes(step, parts):
     """By Gram matrices as by forming every texel's nodes."""
