@@ -15,19 +15,20 @@ import time
 import tracemalloc
 from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
+if __name__ == "__main__":  # tests that import this must not hand it on to what they start
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import numpy as np  # noqa: E402
-from factorization.problems import hemisphere, problem, unobserved_error  # noqa: E402
-from sklearn.decomposition import IncrementalPCA  # noqa: E402
-from sklearn.utils.extmath import randomized_svd  # noqa: E402
+import numpy as np
+from factorization.problems import hemisphere, problem, unobserved_error
+from sklearn.decomposition import IncrementalPCA
+from sklearn.utils.extmath import randomized_svd
 
-from reflfield.factorization import LocalPCA, OnlineSVD, as_source, complete  # noqa: E402
-from reflfield.factorization.clustering import alternate, updated  # noqa: E402
-from reflfield.factorization.sources import reader_of  # noqa: E402
-from reflfield.factorization.workspace import pca_workspace  # noqa: E402
+from reflfield.factorization import LocalPCA, OnlineSVD, as_source, complete
+from reflfield.factorization.clustering import alternate, updated
+from reflfield.factorization.sources import reader_of
+from reflfield.factorization.workspace import pca_workspace
 
 RANK = 12
 # A row has RANK unknowns; errors are over the unobserved entries of rows that were seen by
