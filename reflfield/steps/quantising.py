@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.factorization import Completion
-from reflfield.field.compression import CompressionOptions, cluster_completed
-from reflfield.field.file import PackedSizes
-from reflfield.field.fit import ClusteredModel
-from reflfield.field.model import (
+from reflfield.field.building import (
     BaseSurface,
     FittedReflectance,
     Quantisation,
-    ReflectanceField,
     build_field,
     quantisation_error,
 )
+from reflfield.field.compression import CompressionOptions, cluster_completed
+from reflfield.field.file import PackedSizes
+from reflfield.field.fit import ClusteredModel
+from reflfield.field.model import ReflectanceField
 from reflfield.field.rate import field_of_quality, field_of_size
 from reflfield.field.residual import sample_error
 from reflfield.progress import track

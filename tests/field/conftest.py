@@ -2,11 +2,7 @@
 
 import pytest
 
-from reflfield.field.model import (
-    BaseSurface,
-    FittedReflectance,
-    build_field,
-)
+from reflfield.field.building import BaseSurface, FittedReflectance, build_field
 from reflfield.sphere.rotations import matrix_from_quaternion
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.model import (
+from reflfield.field.building import (
     Quantisation,
     build_field,
     neighbours_in_a_row,

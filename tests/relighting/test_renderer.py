@@ -8,8 +8,8 @@ import pytest
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
+from reflfield.field.building import FittedReflectance, build_field
 from reflfield.field.evaluation import evaluate, texel_taps
-from reflfield.field.model import FittedReflectance, build_field
 from reflfield.field.synthetic import (
     FramedSurface,
     baked_field,
