@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.comparison.residual import sample_error
 from reflfield.factorization import Completion
 from reflfield.field.building import (
     BaseSurface,
@@ -21,7 +22,6 @@ from reflfield.field.file import PackedSizes
 from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
 from reflfield.field.rate import field_of_quality, field_of_size
-from reflfield.field.residual import sample_error
 from reflfield.progress import track
 from reflfield.stages import versions
 from reflfield.steps.job import Job

@@ -20,6 +20,7 @@ from reflfield.alignment.scattered import (
     sharp_targets,
 )
 from reflfield.alignment.splines import NodeTargets
+from reflfield.comparison.residual import sample_error
 from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
 from reflfield.field.compression import cluster_completed, fill_unobserved
@@ -31,7 +32,6 @@ from reflfield.field.fit import (
     solve_coefficients,
 )
 from reflfield.field.frames import improved_block as turned
-from reflfield.field.residual import sample_error
 from reflfield.observations.projection import Projection, project_photographs
 from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot

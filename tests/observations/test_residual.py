@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from reflfield.capture.images import encode_srgb
+from reflfield.comparison.residual import sample_error
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
-from reflfield.field.residual import sample_error
 from reflfield.field.synthetic import baked_field, blinn_phong, square_surface
 from reflfield.observations.projection import directions_of, pairs_photographed
 from reflfield.observations.reading import TexelReader

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.images import encode_srgb
+from reflfield.comparison.metrics import psnr
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.model import ReflectanceField
@@ -19,8 +20,6 @@ Floats = NDArray[np.float32]
 # Enough for two digits of the error; more only take time.
 MOST_SAMPLES = 500_000
 BLOCK_BYTES = 64 << 20
-# As in comparisons with photographs.
-PSNR_CAP_DB = 100.0
 
 
 @dataclass(frozen=True)
@@ -115,9 +114,7 @@ def _relative(predicted: Floats, measured: Floats) -> float:
 def _psnr_ldr(predicted: Floats, measured: Floats) -> float:
     white = float(np.percentile(measured @ LUMINANCE, 99.5))
     exposure = 1.0 / white if white > 0 else 1.0
-    shown = (
-        encode_srgb(np.clip(exposure * values, 0.0, 1.0)) for values in (predicted, measured)
-    )
-    difference = np.subtract(*shown)
-    mean_square = float(np.mean(np.square(difference, dtype=np.float64)))
-    return float(-10.0 * np.log10(max(mean_square, 10.0 ** (-PSNR_CAP_DB / 10.0))))
+    shown = [
+        encode_srgb(np.clip(exposure * values, 0.0, 1.0)) for values in (measured, predicted)
+    ]
+    return psnr(*shown)
