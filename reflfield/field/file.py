@@ -110,7 +110,7 @@ def _write_archive(
     file: IO[bytes], reflectance_field: ReflectanceField, members: Mapping[str, PackedArray]
 ) -> None:
     with zipfile.ZipFile(file, "w") as archive:
-        _add(archive, HEADER, _header(reflectance_field, members))
+        _add(archive, HEADER, _header(reflectance_field, members), zipfile.ZIP_DEFLATED)
         for name, packed in members.items():
             _add(archive, member_name(name), packed.content)
 
@@ -267,9 +267,11 @@ def _header(reflectance_field: ReflectanceField, members: Mapping[str, PackedArr
         ) from error
 
 
-def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+def _add(
+    archive: zipfile.ZipFile, name: str, content: bytes, method: int = zipfile.ZIP_STORED
+) -> None:
     info = zipfile.ZipInfo(name, FIXED_TIME)
-    info.compress_type = zipfile.ZIP_STORED
+    info.compress_type = method
     info.create_system = 3  # Unix, wherever it is written
     info.external_attr = 0o644 << 16
     archive.writestr(info, content)

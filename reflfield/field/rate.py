@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import log2
 
 from reflfield.errors import InputError
@@ -40,21 +41,19 @@ def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
         If even the coarsest field is larger.
     """
     sizes = PackedSizes()
-    low, high = log2(step / WIDEST), log2(step * WIDEST)
+    bracket = _Bracket(log2(step / WIDEST), log2(step * WIDEST))
     best, at = None, log2(step)
-    bytes_low, bytes_high = None, None
     for _ in range(MOST_TRIALS):
         field = build(2.0**at)
         found = sizes.of(field)
+        bracket.tighten(at, found, size)
         if found <= size:
-            best, high, bytes_high = field, at, found
-            if found >= (1.0 - CLOSE) * size or high - low < 1e-3:
-                return field
-        else:
-            low, bytes_low = at, found
-        at = _next_trial(low, high, bytes_low, bytes_high, size)
-        if best is None and log2(step * WIDEST) - low < 0.1:
+            best = field
+            if found >= (1.0 - CLOSE) * size:
+                break
+        if bracket.width < 1e-3:
             break
+        at = bracket.next(size)
     if best is None:
         raise InputError(
             f"size: expected at least {found:,} bytes, which surface, texture map and frames "
@@ -64,20 +63,42 @@ def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
     return best
 
 
-def _next_trial(
-    low: float, high: float, bytes_low: int | None, bytes_high: int | None, size: int
-) -> float:
-    """Where sizes that fall as the logarithm of the step grows are expected to pass `size`.
+@dataclass
+class _Bracket:
+    """Logarithms of a step between which a size is passed; sizes fall as the step grows."""
 
-    Kept off the ends, so that a bend in the curve cannot stall the search; while one end is
-    not measured, a factor of four beyond the other.
-    """
-    if bytes_low is None:
-        return max(high - 2.0, 0.5 * (low + high)) if high - 2.0 > low else 0.5 * (low + high)
-    if bytes_high is None:
-        return min(low + 2.0, 0.5 * (low + high)) if low + 2.0 < high else 0.5 * (low + high)
-    share = (bytes_low - size) / max(bytes_low - bytes_high, 1)
-    return low + min(max(share, 0.1), 0.9) * (high - low)
+    low: float
+    high: float
+    bytes_low: int | None = None
+    bytes_high: int | None = None
+    stride: float = 1.0
+
+    @property
+    def width(self) -> float:
+        """Of what is left."""
+        return self.high - self.low
+
+    def tighten(self, at: float, found: int, size: int) -> None:
+        """Move the end on whose side a trial fell."""
+        if found > size:
+            self.low, self.bytes_low = at, found
+        else:
+            self.high, self.bytes_high = at, found
+
+    def next(self, size: int) -> float:
+        """Where the size is expected, by interpolation between two ends that are known.
+
+        Kept off the ends, so that a bend in the curve cannot stall the search. While one end is
+        not measured, strides beyond the other that double.
+        """
+        if self.bytes_low is None or self.bytes_high is None:
+            self.stride *= 2.0
+            towards = self.high - self.stride, self.low + self.stride
+            if self.bytes_low is None:
+                return max(towards[0], self.low)
+            return min(towards[1], self.high)
+        share = (self.bytes_low - size) / max(self.bytes_low - self.bytes_high, 1)
+        return self.low + min(max(share, 0.1), 0.9) * self.width
 
 
 def field_of_quality(

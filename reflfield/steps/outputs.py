@@ -327,11 +327,10 @@ def _truth_sections(
 
 
 def _compression_section(job: Job) -> Section:
-    field = open_field(job.stages.root / "compression" / "field.rfld")
-    stored = job.result("compression", "model.npz")
-    parts = describe(field).stored_bytes
-    curves = {"completion": stored["spread"]} if "spread" in stored else None
-    return sections.compression_section(parts, raw_bytes(job), singular_values=curves)
+    path = job.stages.root / "compression" / "field.rfld"
+    parts = describe(open_field(path)).stored_bytes
+    rest = path.stat().st_size - sum(parts.values())
+    return sections.compression_section({**parts, "header, names": rest}, raw_bytes(job))
 
 
 def _stage(record: Any) -> sections.StageRecord:

@@ -85,7 +85,7 @@ def test_every_section_is_there_with_figures_and_captions(page):
 def test_navigation_leads_to_sections(page):
     links = [value[1:] for value in page.values("href")]
     ids = page.values("id")
-    assert len(links) == 11
+    assert len(links) == 12
     assert set(links) <= set(ids)
     assert len(ids) == len(set(ids))
 

@@ -180,3 +180,19 @@ def test_accounts_that_do_not_add_up_are_said():
     ]
     assert ("", "", "not accounted for", 2) in tables(section)[0].rows
     assert len(sections.accounts_section([whole]).items) == 1
+
+
+def test_rates_are_drawn_and_tabled_and_no_point_is_refused():
+    points = [
+        sections.RatePoint("with", 800_000, 31.0, 30.5),
+        sections.RatePoint("with", 200_000, 28.0, 27.0),
+    ]
+    section = sections.rate_distortion_section(points, "a note")
+    figure, table, note = section.items
+    assert len(figure.panels) == 2
+    assert table.rows[1][2:] == (200_000, "28.00", "27.00")
+    assert note.text == "a note"
+    alone = [sections.RatePoint("with", 5, 31.0, None)]
+    assert len(sections.rate_distortion_section(alone).items[0].panels) == 1
+    with pytest.raises(InputError, match="points"):
+        sections.rate_distortion_section([])

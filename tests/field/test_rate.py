@@ -21,7 +21,7 @@ def test_size_is_that_of_the_file(build, tmp_path):
     assert PackedSizes().of(field) == (tmp_path / "f.rfld").stat().st_size
 
 
-@pytest.mark.parametrize("start", [1e-4, 0.02, 3.0])
+@pytest.mark.parametrize("start", [1e-4, 0.02, 0.5])
 @pytest.mark.parametrize("size", [9_000, 13_000])
 def test_field_of_a_size_comes_close_from_below_wherever_it_begins(build, start, size):
     found = PackedSizes().of(field_of_size(build, start, size))
@@ -48,3 +48,7 @@ def test_a_quality_out_of_reach_gives_the_finest(build, parts):
 
     field = field_of_quality(build, quality, 0.02, 500.0)
     assert field.arrays["core_scale"][0] == np.float32(0.02 / 64)
+
+
+def test_a_size_beyond_the_finest_gives_the_finest(build):
+    assert PackedSizes().of(field_of_size(build, 1.0, 10**6)) < 20_000

@@ -6,16 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 from reflfield.comparison import plots
 from reflfield.comparison.metrics import (
     Comparison,
 )
 from reflfield.comparison.report import (
     Figure,
-    Item,
     KeyNumber,
     Panel,
     Section,
@@ -72,26 +68,16 @@ def key_numbers(
     return tuple(found)
 
 
-def compression_section(
-    parts: Mapping[str, int],
-    raw_bytes: int,
-    *,
-    singular_values: Mapping[str, ArrayLike] | None = None,
-    curve: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
-) -> Section:
-    """Compression: sizes of the file's parts, decay of the factors, rate and distortion.
+def compression_section(parts: Mapping[str, int], raw_bytes: int) -> Section:
+    """Compression: sizes of the file's parts.
 
     Parameters
     ----------
     parts : mapping of name to bytes
-        Parts of the field file.
+        Parts of the field file, all of it.
     raw_bytes : int
         Samples of the capture as half floats:
         ``n_texels * n_views * n_lights * 3 * 2``.
-    singular_values : mapping of name to (k,) array_like, optional
-        Largest first, for example of each cluster.
-    curve : mapping of name to (bytes, PSNR), optional
-        Rate-distortion curves, such as with and without alignment.
 
     Returns
     -------
@@ -113,39 +99,8 @@ def compression_section(
         "Where the bytes of the field file go.",
         emphasised=(len(rows),),
     )
-    items: list[Item] = [table]
-    panels = _decay_panel(singular_values) + _curve_panel(curve)
-    if panels:
-        caption = (
-            "Steep decay means that few components suffice. On the rate-distortion curve, up "
-            "and to the left is better."
-        )
-        items.insert(0, Figure(panels, caption, min_width=300))
     intro = f"The field file holds {format_bytes(total)}.{ratio}"
-    return Section("Compression", intro, tuple(items))
-
-
-def _decay_panel(singular_values: Mapping[str, ArrayLike] | None) -> tuple[Panel, ...]:
-    if not singular_values:
-        return ()
-    series = {}
-    for name, values in singular_values.items():
-        sizes = np.asarray(values, dtype=np.float64).ravel()
-        series[name] = (np.arange(1, sizes.size + 1), sizes / max(sizes.max(initial=0), 1e-300))
-    plot = plots.lines(series, "component", "singular value / largest", log_y=True)
-    return (Panel(plot, "decay of singular values"),)
-
-
-def _curve_panel(
-    curve: Mapping[str, tuple[ArrayLike, ArrayLike]] | None,
-) -> tuple[Panel, ...]:
-    if not curve:
-        return ()
-    series = {
-        n: (np.asarray(size, float) / 1e6, quality) for n, (size, quality) in curve.items()
-    }
-    plot = plots.lines(series, "file size, MB", "held-out PSNR, dB", log_x=True)
-    return (Panel(plot, "size against quality"),)
+    return Section("Compression", intro, (table,))
 
 
 @dataclass(frozen=True)
