@@ -55,8 +55,8 @@ COMPLETING = "completing all texels"
 BY_TEXELS = {
     "completion": (COMPLETING,),
     "alignment": ("frames on the samples",),
+    "resampling": (COMPLETING,),
     "compression": (
-        COMPLETING,
         "frames against the model",
         "coefficients on the samples, part 1",
         "coefficients on the samples, part 2",

@@ -109,11 +109,22 @@ ORDER = (
         after=("completion",),
         options=lambda options: (options.alignment, options.seed),
     ),
-    # raw samples again, in the aligned frames -> clustered local PCA -> field file
+    # raw samples again, in the aligned frames, on the grid; missing samples filled
+    Stage(
+        "resampling",
+        reflectance.write_resampling,
+        after=("alignment",),
+        options=lambda options: (
+            options.compression.rank,
+            options.compression.training_texels,
+            options.seed,
+        ),
+    ),
+    # clustered local PCA, fitted to the raw samples -> field file
     Stage(
         "compression",
         reflectance.write_compression,
-        after=("alignment",),
+        after=("resampling",),
         options=lambda options: (options.compression, options.seed),
         reads=lambda job: {"name": job.capture.name},
     ),

@@ -71,7 +71,7 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
             "texel not seen by the camera": int(unseen),
             "texel in shadow of the surface": int(shadowed),
             "below the horizon of the texel's frame, or outside the light's cone": counts[
-                "observations"
+                "completion"
             ]["samples observed"]
             - used,
         },

@@ -23,7 +23,11 @@ from reflfield.alignment.splines import NodeTargets
 from reflfield.comparison.residual import sample_error
 from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
-from reflfield.field.compression import cluster_completed, fill_unobserved
+from reflfield.field.compression import (
+    CompressionOptions,
+    cluster_completed,
+    fill_unobserved,
+)
 from reflfield.field.file import open_field, write_field
 from reflfield.field.fit import (
     ClusteredModel,
@@ -50,6 +54,8 @@ Indices = NDArray[np.intp]
 
 # Share of the memory that the columns of a completion may take while it is fitted.
 COLUMNS_SHARE = 1 / 3
+# In the results of the resampling: coefficients of all texels, beside those of the completion.
+ALL_COEFFICIENTS = "all_coefficients"
 # On raw samples: a few rounds, the targets on texels enough for grids of this side.
 REFINEMENT = RefinementOptions(side=25, rounds=4, texels_per_cluster=8192)
 
@@ -61,12 +67,11 @@ def write_observations(job: Job, folder: Path) -> dict[str, Any]:
         job.training, job.texels.position, job.view_seen, location, job.resources.block_bytes
     )
     project_photographs(projection, job.blocks(folder), writers_at_once(job))
-    observed = job.observed
+    n_samples = job.view_seen.size * job.training.n_lights
     return {
         "photographs": len(job.training.photographs),
-        "samples": int(np.prod(observed.views.shape)) * job.training.n_lights,
-        "samples observed": observed.count(),
-        "raw bytes": int(np.prod(observed.views.shape)) * job.training.n_lights * 6,
+        "samples": n_samples,
+        "raw bytes": n_samples * 6,
     }
 
 
@@ -90,6 +95,7 @@ def write_completion(job: Job, folder: Path) -> dict[str, Any]:
         "texels that shape the basis": len(chosen),
         "texels completed": len(job.seen_texels),
         "texels without samples": job.base_reader.n_texels - len(job.seen_texels),
+        "samples observed": job.observed.count(),
         "share of nodes observed": float(found.coverage.mean()),
         "residual": float(found.residuals[-1]),
     }
@@ -129,7 +135,7 @@ def completed(
             found = complete(
                 columns, rank=rank, passes=passes, method=method, n_channels=3, seed=seed
             )
-        return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+        return arrays_of(found)
 
     found = completion_of(blocks.once("basis", basis))
     coefficients = np.zeros((reader.n_texels, found.rank), np.float32)
@@ -145,6 +151,11 @@ def completed(
         )
         coefficients[others] = parts.joined("coefficients")
     return found, coefficients
+
+
+def arrays_of(found: Completion) -> dict[str, NDArray[Any]]:
+    """Entries of a completion as arrays."""
+    return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
 
 
 def completion_of(stored: dict[str, Any]) -> Completion:
@@ -382,13 +393,24 @@ def _band_limit(wanted: int, directions: NDArray[np.float64]) -> int:
     return min(wanted, safe_band_limit(int((directions[:, 2] > 0).sum())))
 
 
+def write_resampling(job: Job, folder: Path) -> dict[str, Any]:
+    """Raw samples in the aligned frames on the grids, and what was not observed filled."""
+    found = resampled(job, aligned_frames(job), job.options.compression, job.blocks(folder))
+    arrays: dict[str, Any] = arrays_of(found.completion)
+    np.savez(folder / "resampling.npz", **{**arrays, ALL_COEFFICIENTS: found.coefficients})
+    return {
+        "texels that shape the basis": len(found.completion.coefficients),
+        "residual": float(found.completion.residuals[-1]),
+    }
+
+
 def write_compression(job: Job, folder: Path) -> dict[str, Any]:
-    """Raw samples in the aligned frames -> clusters, mean, basis, coefficients -> field."""
-    stored = job.result("alignment", "alignment.npz")
-    frames = AlignedFrames(stored["local_from_base"], np.flatnonzero(stored["aligned"]))
-    return write_compressed(
-        frames, FieldMaker(job, job.options.compression, plain(job.options)), folder
-    )
+    """Clusters, mean, basis and coefficients of the aligned texels -> field."""
+    stored = job.result("resampling", "resampling.npz")
+    coefficients = stored.pop(ALL_COEFFICIENTS)
+    found = Resampled(aligned_frames(job), completion_of(stored), coefficients)
+    maker = FieldMaker(job, job.options.compression, plain(job.options))
+    return write_compressed(found, maker, folder)
 
 
 def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
@@ -405,7 +427,8 @@ def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
         size=(job.stages.root / "compression" / "field.rfld").stat().st_size,
         psnr=0.0,
     )
-    return write_compressed(frames, FieldMaker(job, alike, made_with), folder)
+    found = resampled(job, frames, alike, job.blocks(folder))
+    return write_compressed(found, FieldMaker(job, alike, made_with), folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,10 +446,51 @@ class AlignedFrames:
     free: Indices
 
 
-def write_compressed(frames: AlignedFrames, maker: FieldMaker, folder: Path) -> dict[str, Any]:
+def aligned_frames(job: Job) -> AlignedFrames:
+    """What the alignment has found."""
+    stored = job.result("alignment", "alignment.npz")
+    return AlignedFrames(stored["local_from_base"], np.flatnonzero(stored["aligned"]))
+
+
+@dataclass(frozen=True, eq=False)
+class Resampled:
+    """Texels on the grids of their frames, what was not observed of them filled.
+
+    Parameters
+    ----------
+    frames : AlignedFrames
+    completion : Completion
+        Of the texels that shape the basis.
+    coefficients : (n_texels, rank) float32
+        Of all texels in that basis.
+    """
+
+    frames: AlignedFrames
+    completion: Completion
+    coefficients: Floats
+
+
+def resampled(
+    job: Job, frames: AlignedFrames, options: CompressionOptions, blocks: Blocks
+) -> Resampled:
+    """Resample all texels from their raw samples in the given frames, and complete them."""
+    reader = job.base_reader.rotated(local_frames(job, frames.local_from_base))
+    found, coefficients = completed(
+        reader,
+        job.training_texels(options.training_texels),
+        job.seen_texels,
+        rank=options.rank,
+        seed=job.options.seed,
+        resources=job.resources,
+        blocks=blocks,
+    )
+    return Resampled(frames, found, coefficients)
+
+
+def write_compressed(found: Resampled, maker: FieldMaker, folder: Path) -> dict[str, Any]:
     """Fit a field in the given frames, write it, and measure it on the samples."""
     job = maker.job
-    model, reader = fitted_model(maker, frames, job.blocks(folder))
+    model, reader = fitted_model(maker, found, job.blocks(folder))
     made = maker.made(model, reader.local_from_world)
     write_field(folder / "field.rfld", made)
     write_model(folder / "model.npz", model, reader.local_from_world)
@@ -465,27 +529,22 @@ def write_model(path: Path, model: ClusteredModel, frames: Floats) -> None:
 
 
 def fitted_model(
-    maker: FieldMaker, frames: AlignedFrames, blocks: Blocks
+    maker: FieldMaker, found: Resampled, blocks: Blocks
 ) -> tuple[ClusteredModel, TexelReader]:
     """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
     job, options = maker.job, maker.options
     seen = job.seen_texels
-    reader = job.base_reader.rotated(local_frames(job, frames.local_from_base))
-    found, coefficients = completed(
-        reader,
-        job.training_texels(options.training_texels),
-        seen,
-        rank=options.rank,
-        seed=job.options.seed,
-        resources=job.resources,
-        blocks=blocks,
-    )
+    reader = job.base_reader.rotated(local_frames(job, found.frames.local_from_base))
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     if maker.searches:
-        options = maker.chosen(found, coefficients, reader.local_from_world, counts)
-    model = cluster_completed(found, coefficients, seen, counts, options, job.options.seed)
+        options = maker.chosen(
+            found.completion, found.coefficients, reader.local_from_world, counts
+        )
+    model = cluster_completed(
+        found.completion, found.coefficients, seen, counts, options, job.options.seed
+    )
     if options.fits_samples(job.observed.count() / len(seen)):
-        model, reader = _fitted_to_samples(job, model, reader, frames.free, blocks)
+        model, reader = _fitted_to_samples(job, model, reader, found.frames.free, blocks)
     return fill_unobserved(model, job.texels.position, seen), reader
 
 

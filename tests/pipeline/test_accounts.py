@@ -54,7 +54,7 @@ def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):
     ("stage", "count"),
     [("observations", "photographs"), ("completion", "texels completed"),
      ("alignment", "texels aligned"), ("compression", "texels fitted"),
-     ("observations", "samples observed")],
+     ("completion", "samples observed")],
 )  # fmt: skip
 def test_a_stage_that_loses_one_is_found_out(finished_job, stage, count):
     record = next(r for r in finished_job.stages.records if r.name == stage)

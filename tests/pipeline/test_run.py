@@ -201,6 +201,7 @@ class TestSecondRun:
             ("alignment.iterations=2", "alignment", "alignment"),
             ("compression.n_clusters=1", "compression", "compression"),
             ("alignment.refine=false", "alignment", "compression"),
+            ("compression.rank=3", "resampling", "compression"),
             ("compression.samples.frame_spread_deg=0.0", "compression", "compression"),
             ("relighting.samples_per_pixel=4", "comparison", "report"),
         ],
@@ -217,8 +218,8 @@ class TestSecondRun:
     def test_field_without_alignment_follows_the_size_of_that_with_it(self, run_copy, run_tiny):
         run_tiny(run_copy, "--set", "alignment.iterations=2", "--until", "without_alignment")
         again = [stage for stage, reused in states(run_copy).items() if not reused]
-        assert again == ["alignment", "compression", "without_alignment"]
-        folders = [run_copy / "stages" / name for name in again[1:]]
+        assert again == ["alignment", "resampling", "compression", "without_alignment"]
+        folders = [run_copy / "stages" / name for name in again[2:]]
         sizes = [(folder / "field.rfld").stat().st_size for folder in folders]
         assert abs(sizes[0] - sizes[1]) < 0.02 * sizes[0]
 
@@ -292,7 +293,7 @@ class TestSecondRun:
         before = digest(run_copy / "field.rfld")
         run_tiny(run_copy, "--from", "alignment", "--until", "compression")
         again = [stage for stage, reused in states(run_copy).items() if not reused]
-        assert again == ["alignment", "compression"]
+        assert again == ["alignment", "resampling", "compression"]
         assert digest(run_copy / "field.rfld") == before
 
     def test_until_stops_there(self, run_tiny, tmp_path):
