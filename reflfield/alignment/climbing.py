@@ -50,8 +50,14 @@ def scale(vector: NDArray[np.float64], n: int, factor: float) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _newton_step(f: NDArray[np.float64], radius: float, step: NDArray[np.float64]) -> float:
-    """Uphill step of at most `radius`: Newton's where concave, else damped; its length."""
+def _newton_step(
+    f: NDArray[np.float64], radius: float, step: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Uphill step of at most `radius`: Newton's where concave, else damped.
+
+    Its length and, where the function is not concave, the most that its second-order
+    expansion rises within the first trust radius; else 0.
+    """
     xx, yy, zz, xy, xz, yz = -f[4], -f[5], -f[6], -f[7], -f[8], -f[9]
     # Lowest eigenvalue of the symmetric 3x3 matrix, by its trigonometric solution.
     mean = (xx + yy + zz) / 3.0
@@ -71,7 +77,7 @@ def _newton_step(f: NDArray[np.float64], radius: float, step: NDArray[np.float64
     det = xx * c0 + xy * c1 + xz * c2
     if not det > 0.0:
         scale(step, 3, 0.0)
-        return 0.0
+        return 0.0, 0.0
     step[0] = (c0 * f[1] + c1 * f[2] + c2 * f[3]) / det
     step[1] = (c1 * f[1] + (xx * zz - xz * xz) * f[2] + (xy * xz - xx * yz) * f[3]) / det
     step[2] = (c2 * f[1] + (xy * xz - xx * yz) * f[2] + (xx * yy - xy * xy) * f[3]) / det
@@ -79,7 +85,9 @@ def _newton_step(f: NDArray[np.float64], radius: float, step: NDArray[np.float64
     if length > radius:
         scale(step, 3, radius / length)
         length = radius
-    return length
+    if damping == 0.0:
+        return length, 0.0
+    return length, FIRST_TRUST_RADIUS * (gradient - 0.5 * FIRST_TRUST_RADIUS * lowest)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,7 +165,7 @@ def ascend(
             found[:10] = f
         else:
             radius = 0.25 * length
-        length = _newton_step(found, radius, step)
+        length, rise = _newton_step(found, radius, step)
         length = _try_step(rotation, step, length, lowest_z, trial)
         if length < short:
             # Too short to be worth an evaluation, but free to take.
@@ -165,7 +173,9 @@ def ascend(
                 copy_matrix(trial, rotation)
                 found[0] = max(value, _predicted(found, step))
             break
-        if length < RELIABLE_STEP and _predicted(found, step) < hoped:
+        # A short step foretells the peak only where the function is concave: from a saddle,
+        # where the approach with few degrees often ends, most of the rise is still to come.
+        if length < RELIABLE_STEP and max(_predicted(found, step), value + rise) < hoped:
             found[0] = _predicted(found, step)
             break
     found[10] = length
