@@ -12,7 +12,6 @@ import io
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -22,12 +21,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import dask
-import distributed
 import numpy as np
 from dask.callbacks import Callback
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from reflfield.cluster import ClusterWork
 from reflfield.errors import InputError
 from reflfield.files import replacing
 from reflfield.progress import report
@@ -36,10 +35,6 @@ Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 # What computes one block: from the context that all blocks share and the block itself.
 BlockFunction: TypeAlias = Callable[[Any, Any], Arrays]
 Keep: TypeAlias = Callable[[int, Any], None]
-
-# How often a block is tried again whose worker was lost or failed.
-RETRIES = 3
-CONNECTING_SECONDS = 30
 
 
 class _OneCore:
@@ -84,21 +79,6 @@ def _thread_pools(n_modules: int) -> ThreadpoolController:
     return ThreadpoolController()
 
 
-@lru_cache(maxsize=1)
-def _limit_worker() -> None:
-    """Give the BLAS of a cluster's worker one thread, for good: its tasks overlap."""
-    ThreadpoolController().limit(limits=1, user_api="blas")
-
-
-def _on_worker(function: BlockFunction, context: Any, block: Any) -> Any:
-    _limit_worker()
-    return function(context, block)
-
-
-def _same(context: Any) -> Any:
-    return context
-
-
 @dataclass(frozen=True)
 class Scheduler:
     """Who computes the blocks; nothing of it changes what they give.
@@ -124,7 +104,7 @@ class Scheduler:
         *,
         at_once: int | None = None,
         done: Callable[[], None] = lambda: None,
-    ) -> None:
+    ) -> int:
         """Compute blocks, in any order.
 
         Parameters
@@ -141,16 +121,25 @@ class Scheduler:
         done : callable
             Called after each block, from this thread.
 
+        Returns
+        -------
+        int
+            How often a block was begun again: one that the cluster had lost with a worker
+            that died, or one that failed at first.
+
         Raises
         ------
         InputError
-            If no scheduler answers at `address`.
+            If no scheduler answers at `address`, or it, or its workers, are lost for good.
         """
         if not blocks:
-            return
+            return 0
         if self.address is not None:
-            self._on_cluster(function, context, blocks, keep, done)
-            return
+            work = ClusterWork(self.address, function, context)
+            for number, result in work.results(blocks):
+                keep(number, result)
+                done()
+            return work.begun - len(blocks)
         threads = max(1, min(self.workers, at_once or self.workers, len(blocks)))
 
         def compute(number: int) -> None:
@@ -164,39 +153,7 @@ class Scheduler:
         # Of one's own, to be left when no block is at work any more, also after an error.
         with one_core_blas(), ThreadPoolExecutor(threads) as pool, finished:
             dask.compute(*tasks, scheduler="threads", pool=pool)
-
-    def _on_cluster(
-        self,
-        function: BlockFunction,
-        context: Any,
-        blocks: Mapping[int, Any],
-        keep: Keep,
-        done: Callable[[], None],
-    ) -> None:
-        with self._client() as client, client.as_current(), warnings.catch_warnings():
-            # The context is one large argument, sent once; as a task it outlives its worker.
-            warnings.filterwarnings("ignore", message="Sending large graph")
-            shared = client.submit(_same, context, pure=False, retries=RETRIES)
-            number_of = {
-                client.submit(
-                    _on_worker, function, shared, block, pure=False, retries=RETRIES
-                ): number
-                for number, block in blocks.items()
-            }
-            for future in distributed.as_completed(list(number_of)):
-                keep(number_of.pop(future), future.result())
-                done()
-
-    def _client(self) -> distributed.Client:
-        try:
-            return distributed.Client(
-                self.address, timeout=CONNECTING_SECONDS, set_as_default=False
-            )
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--scheduler: expected a dask scheduler at {self.address}, found none "
-                f"({error}); start one with `dask scheduler`"
-            ) from error
+        return 0
 
 
 @dataclass(frozen=True)
@@ -277,12 +234,15 @@ class Tally:
     Parameters
     ----------
     computed, resumed : int
+    repeated : int
+        Times that one of those computed was begun again, lost with a worker of a cluster.
     cpu_seconds : dict of str to float
         Of the processor, this process only, by the name of the work.
     """
 
     computed: int = 0
     resumed: int = 0
+    repeated: int = 0
     cpu_seconds: dict[str, float] = field(default_factory=dict, compare=False)
 
     @contextmanager
@@ -357,7 +317,9 @@ class Blocks:
 
         before = self.tally.computed
         with self.tally.timing(name):
-            self.scheduler.run(function, context, left, files.write, at_once=at_once, done=done)
+            self.tally.repeated += self.scheduler.run(
+                function, context, left, files.write, at_once=at_once, done=done
+            )
         return Results(files, len(blocks))
 
     def _kept(

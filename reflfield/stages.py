@@ -68,6 +68,9 @@ class StageRecord:
     blocks_computed, blocks_resumed : int
         Blocks of work that this run has done, and that it found done by one that was
         interrupted.
+    blocks_repeated : int
+        Times that one of those done was begun again, because a cluster's worker had died at
+        it or failed.
     work : dict of str to float
         Processor seconds of each work by blocks; of work inside another, both.
     """
@@ -82,6 +85,7 @@ class StageRecord:
     cpu_seconds: float = 0.0
     blocks_computed: int = 0
     blocks_resumed: int = 0
+    blocks_repeated: int = 0
     work: dict[str, float] = field(default_factory=dict)
 
 
@@ -199,6 +203,7 @@ class StageFolder:
         try:
             with MemoryWatch() as watch:
                 counts = dict(compute(partial))
+            forget_unfinished(partial)
         except BaseException:
             if not has_blocks(partial):
                 shutil.rmtree(partial, ignore_errors=True)
@@ -213,6 +218,7 @@ class StageFolder:
             cpu_seconds=time.process_time() - spent,
             blocks_computed=self.tally.computed,
             blocks_resumed=self.tally.resumed,
+            blocks_repeated=self.tally.repeated,
             work=self.tally.cpu_seconds,
         )
         with replacing(partial / RECORD) as unfinished:
@@ -269,8 +275,13 @@ def _matching_record(folder: Path, key: str) -> StageRecord | None:
         return None
     if not isinstance(found, dict) or found.get("key") != key:
         return None
-    kept = {entry.name: found[entry.name] for entry in fields(StageRecord)}
-    return StageRecord(**{**kept, "reused": True})
+    kept = {
+        entry.name: found[entry.name] for entry in fields(StageRecord) if entry.name in found
+    }
+    try:
+        return StageRecord(**{**kept, "reused": True})
+    except TypeError:
+        return None
 
 
 def folder_bytes(folder: Path, without: str) -> int:
@@ -297,10 +308,18 @@ def prepare_partial(partial: Path, key: str, *, fresh: bool) -> None:
     for entry in partial.iterdir():
         if entry.name not in (KEY, BLOCKS, *RESTARTABLE):
             remove(entry)
+    forget_unfinished(partial)
+
+
+def forget_unfinished(partial: Path) -> None:
+    """Remove what a process that was killed, this run's or a worker's, left of a chunk.
+
+    A worker that an earlier command had left at work may be writing one still: it is
+    renamed meanwhile, or written once more by whoever needs it.
+    """
     for name in RESTARTABLE:
-        # What a kill left of a chunk that was being written.
         for unfinished in (partial / name).rglob("*.partial"):
-            unfinished.unlink()
+            unfinished.unlink(missing_ok=True)
 
 
 def key_of(partial: Path) -> str:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import distributed
 import numpy as np
+import psutil
 import pytest
 
 SEED = 20060905  # one seed for all; change it with --seed
@@ -41,13 +47,100 @@ def rounding():
     return tolerance
 
 
+class Processes:
+    """A dask cluster of commands in processes of their own, to be killed.
+
+    The workers find the modules of `paths`; `environment` is added to that of all.
+    """
+
+    def __init__(self, folder, paths, environment):
+        self.folder, self.started = folder, []
+        found = os.pathsep.join(filter(None, [*map(str, paths), os.environ.get("PYTHONPATH")]))
+        self.environment = {**os.environ, "PYTHONPATH": found, **environment}
+        named = folder / "scheduler.json"
+        words = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--no-show")
+        self.scheduler = self.start("scheduler", *words, "--scheduler-file", named)
+        until(lambda: named.is_file() and named.read_text().endswith("}"))
+        self.address = json.loads(named.read_text())["address"]
+
+    def start(self, kind, *words):
+        """A command of dask; its process."""
+        log = self.folder / f"{kind}-{len(self.started)}.log"
+        with log.open("w") as file:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dask", kind, *map(str, words)],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+                cwd=self.folder,
+            )
+        self.started.append(process)
+        return process
+
+    def add_workers(self, count, *, nanny):
+        """Workers of one thread, and a nanny for each that restarts it; waits for them."""
+        kind = "--nanny" if nanny else "--no-nanny"
+        before = self.count_workers()
+        words = (self.address, kind, "--nthreads", 1, "--no-dashboard", "--host", "127.0.0.1")
+        started = [self.start("worker", *words) for _ in range(count)]
+        until(lambda: self.count_workers() == before + count)
+        return started
+
+    def count_workers(self):
+        """Workers that the scheduler knows."""
+        with distributed.Client(self.address, set_as_default=False) as client:
+            return len(client.nthreads())
+
+    def stop(self):
+        """Kill all processes, those that the nannies have started too."""
+        for process in self.started:
+            if process.poll() is None:
+                # First the nanny, which would start the worker again.
+                family = psutil.Process(process.pid).children(recursive=True)
+                process.send_signal(signal.SIGKILL)
+                for member in family:
+                    try:
+                        member.kill()
+                    except psutil.NoSuchProcess:
+                        continue
+            process.wait()
+
+
+def until(happened, seconds=60):
+    """Wait for something to happen."""
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end, "waited for long"
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def processes(tmp_path_factory):
+    """Function that starts a scheduler whose workers find modules in the given folders."""
+    running = []
+
+    def start(*paths, **environment):
+        running.append(Processes(tmp_path_factory.mktemp("dask"), paths, environment))
+        return running[-1]
+
+    yield start
+    for cluster in running:
+        cluster.stop()
+
+
 @pytest.fixture(scope="session")
-def cluster():
-    """Address of a dask cluster of two worker processes."""
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as local:
-        yield local.scheduler_address
+def cluster(tmp_path_factory):
+    """Address of a dask cluster of two worker processes.
+
+    Not a `LocalCluster`: its nannies would set the environment of this process, too, and
+    what is started from it would compute with another number of threads.
+    """
+    running = Processes(tmp_path_factory.mktemp("dask"), (), {})
+    try:
+        running.add_workers(2, nanny=True)
+        yield running.address
+    finally:
+        running.stop()
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ ROOMS = (
     "files",
     "progress",
     "config",
+    "cluster",
     "scheduling",
     "sphere",
     "factorization",

@@ -8,6 +8,7 @@ import signal
 import pytest
 
 from reflfield.scheduling import BlockFiles
+from reflfield.stages import StageFolder
 
 # Runs the command; the process is killed at the step of its progress that is named.
 KILLED_AT = """
@@ -125,6 +126,33 @@ def test_an_unreadable_record_is_computed_again(run_copy, run_tiny):
         outcome = run_tiny(run_copy, "--until", "hull")
         assert outcome.status == 0
         assert "unchanged" not in outcome.out.splitlines()[1]
+
+
+def test_a_record_of_an_earlier_version_lacks_what_is_counted_since(run_copy, run_tiny):
+    path = run_copy / "stages" / "hull" / "stage.json"
+    record = json.loads(path.read_text())
+    for missing, unchanged in (("blocks_repeated", True), ("seconds", False)):
+        path.write_text(json.dumps({k: v for k, v in record.items() if k != missing}))
+        outcome = run_tiny(run_copy, "--until", "hull")
+        assert outcome.status == 0
+        assert ("unchanged" in outcome.out.splitlines()[1]) == unchanged
+
+
+def test_nothing_is_left_of_a_chunk_whose_writer_was_killed(tmp_path):
+    """By a worker that dies the stage is not stopped."""
+    stages = StageFolder(tmp_path)
+
+    def compute(folder):
+        (folder / "samples").mkdir()
+        (folder / "samples" / "0.0123.partial").write_bytes(b"half")
+        (folder / "samples" / "0").write_bytes(b"whole")
+        return {}
+
+    folder = stages.run("observations", compute)
+    assert [path.name for path in sorted(folder.rglob("*")) if path.is_file()] == [
+        "0",
+        "stage.json",
+    ]
 
 
 def test_two_runs_in_one_folder_are_kept_apart(run_copy, run_tiny):

@@ -1,9 +1,7 @@
 """Blocks: the same results whoever computes them, kept as they finish, found if damaged."""
 
-import os
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -114,37 +112,6 @@ class TestBlocks:
         BlockFiles(tmp_path / "squares").path(1).unlink()
         with pytest.raises(InputError, match=r"000001.block: expected the block"):
             found.joined("square")
-
-
-class TestCluster:
-    def test_address_without_a_scheduler(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("reflfield.scheduling.CONNECTING_SECONDS", 0.3)
-        blocks = Blocks(Scheduler(1, "tcp://127.0.0.1:9"), tmp_path)
-        with pytest.raises(InputError, match="--scheduler: expected a dask scheduler at tcp"):
-            blocks.map("squares", square, 1, [1])
-
-    def test_a_lost_worker_costs_its_blocks(self, tmp_path, cluster):
-        # Inside the test, so that the workers need not find this file.
-        def process_of(folder, block):
-            (Path(folder) / f"{block}.{os.getpid()}").write_text("")
-            if block == 2 and not (Path(folder) / "killed").exists():
-                (Path(folder) / "killed").write_text(str(os.getpid()))
-                os._exit(9)
-            time.sleep(0.05)
-            return {"process": np.array(os.getpid()), "square": np.array(block**2)}
-
-        tally = Tally()
-        blocks = Blocks(Scheduler(1, cluster), tmp_path / "blocks", tally)
-        found = blocks.map("processes", process_of, str(tmp_path), range(12))
-        assert [int(arrays["square"]) for arrays in found] == [n**2 for n in range(12)]
-        assert os.getpid() not in {int(arrays["process"]) for arrays in found}
-        assert tally == Tally(computed=12)
-        # Begun twice: blocks of the worker that was lost, and no other.
-        lost = (tmp_path / "killed").read_text()
-        begun = [path.name.split(".") for path in tmp_path.glob("*.*")]
-        twice = {n for n, _ in begun if sum(other == n for other, _ in begun) > 1}
-        assert twice <= {n for n, process in begun if process == lost}
-        assert "2" in twice
 
 
 def blas_threads():
