@@ -6,19 +6,24 @@ the stage would compute again. Work goes into ``NAME.partial`` and is renamed wh
 is complete. What a stage that failed or was killed has finished of its blocks
 (`reflfield.scheduling`) is taken up by the next run with the same key; all else of it is
 removed. One run at a time may work in a folder.
+
+A stage that is missing here and complete with the same key in another folder is taken over
+from there, by hard links: files of a complete stage are never written again in place, only
+replaced.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -134,12 +139,21 @@ class StageFolder:
         Folder that holds the stages' folders; created.
     redo : set of str
         Stages to compute again even if their key matches.
+    also : sequence of StageFolder
+        Where complete stages are taken over from; of those to compute again, only what has
+        been run there meanwhile.
     """
 
-    def __init__(self, root: Path, redo: set[str] | None = None) -> None:
+    def __init__(
+        self,
+        root: Path,
+        redo: set[str] | None = None,
+        also: Sequence[StageFolder] = (),
+    ) -> None:
         root.mkdir(parents=True, exist_ok=True)
         self.root = root
         self.redo = redo or set()
+        self.also = tuple(also)
         self.records: list[StageRecord] = []
         self.tally = Tally()
 
@@ -181,6 +195,7 @@ class StageFolder:
             return folder
         partial = folder.with_name(f"{name}.partial")
         record = None if name in self.redo else _matching_record(partial, key)
+        record = record or self._taken_over(name, key, partial)
         if record is None:
             prepare_partial(partial, key, fresh=name in self.redo)
             described = {"options": plain(options), "inputs": dict(inputs or {})}
@@ -188,6 +203,16 @@ class StageFolder:
         take_place(partial, folder)
         self.records.append(record)
         return folder
+
+    def _taken_over(self, name: str, key: str, partial: Path) -> StageRecord | None:
+        """The stage as another folder has it, linked into the unfinished one."""
+        for other in self.also:
+            run = other.record(name)
+            found = _matching_record(other.root / name, key)
+            if found is not None and (run or name not in self.redo):
+                link_stage(other.root / name, partial)
+                return replace(found, reused=run is None or run.reused)
+        return None
 
     def _computed(
         self,
@@ -231,12 +256,16 @@ class StageFolder:
         """Work by blocks of the stage that is being computed into `folder`."""
         return Blocks(scheduler, folder / BLOCKS, self.tally)
 
+    def record(self, name: str) -> StageRecord | None:
+        """Record of a stage that has run; None of one that has not."""
+        return next((record for record in self.records if record.name == name), None)
+
     def key(self, name: str) -> str:
         """Key of a stage that has run."""
-        for record in self.records:
-            if record.name == name:
-                return record.key
-        raise InputError(f"stage {name!r}: expected to have run, but it has not")
+        record = self.record(name)
+        if record is None:
+            raise InputError(f"stage {name!r}: expected to have run, but it has not")
+        return record.key
 
 
 def stage_key(name: str, options: Any, inputs: Mapping[str, str], revision: int) -> str:
@@ -342,6 +371,43 @@ def take_place(partial: Path, folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     partial.rename(folder)
     forget_blocks(folder)
+
+
+def link_stage(complete: Path, partial: Path) -> None:
+    """Take a complete stage over into the unfinished folder of another root.
+
+    The record comes last: killed before, the folder is not taken for complete.
+    """
+    shutil.rmtree(partial, ignore_errors=True)
+    link_folder(complete, partial, without=(RECORD, KEY, BLOCKS))
+    link_file(complete / RECORD, partial / RECORD)
+
+
+def link_folder(source: Path, target: Path, without: Sequence[str] = ()) -> None:
+    """A second name for every file below a folder; copies where there are no links.
+
+    Parameters
+    ----------
+    source : Path
+        Its files are never written in place again.
+    target : Path
+        Must not exist.
+    without : sequence of str
+        Files and folders in it that are left out.
+    """
+
+    def left_out(folder: str, names: list[str]) -> set[str]:
+        return set(without) & set(names) if Path(folder) == source else set()
+
+    shutil.copytree(source, target, copy_function=link_file, ignore=left_out)
+
+
+def link_file(source: Path | str, target: Path | str) -> None:
+    """A second name for a file; a copy on another file system, or one without links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def forget_blocks(folder: Path) -> None:

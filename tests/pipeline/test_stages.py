@@ -1,0 +1,137 @@
+"""Stages are taken over from other folders by key, whole or not at all."""
+
+import errno
+import os
+import shutil
+
+import pytest
+
+from reflfield.stages import RECORD, StageFolder
+
+OPTIONS = {"side": 5}
+
+
+def write_sum(folder):
+    """A stage with a file, a folder of files, and the leavings of its blocks."""
+    (folder / "sum.txt").write_text("6")
+    (folder / "samples" / "c").mkdir(parents=True)
+    (folder / "samples" / "c" / "0").write_bytes(b"\1\2")
+    # Named like what belongs to the stage alone, but farther down.
+    (folder / "samples" / "blocks").write_bytes(b"\3")
+    return {"terms": 3}
+
+
+def refused(folder):
+    raise AssertionError(f"{folder}: computed, not taken over")
+
+
+def contents(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+@pytest.fixture
+def other(tmp_path):
+    """A folder in which an earlier process has completed a stage."""
+    StageFolder(tmp_path / "other").run("sum", write_sum, options=OPTIONS)
+    return StageFolder(tmp_path / "other")
+
+
+@pytest.fixture
+def folder(other, tmp_path):
+    return StageFolder(tmp_path / "own", also=[other])
+
+
+def test_taken_over_with_a_second_name_for_every_file(folder, other):
+    made = folder.run("sum", refused, options=OPTIONS)
+    assert contents(made) == contents(other.root / "sum")
+    assert {"sum.txt", "samples/c/0", "samples/blocks", RECORD} == set(contents(made))
+    for name in contents(made):
+        assert (made / name).samefile(other.root / "sum" / name)
+    (record,) = folder.records
+    assert record.counts == {"terms": 3}
+    assert record.reused
+    assert [path.name for path in folder.root.iterdir()] == ["sum"]
+
+
+def test_another_key_is_computed(folder, other):
+    before = contents(other.root / "sum")
+    made = folder.run("sum", write_sum, options={"side": 6})
+    assert not (made / "sum.txt").samefile(other.root / "sum" / "sum.txt")
+    assert not folder.records[0].reused
+    assert contents(other.root / "sum") == before
+
+
+def test_replaced_here_it_stays_there(folder, other):
+    folder.run("sum", refused, options=OPTIONS)
+    folder.run("sum", write_sum, options={"side": 6})
+    shutil.rmtree(folder.root / "sum")
+    StageFolder(folder.root.parent / "third", also=[other]).run("sum", refused, options=OPTIONS)
+
+
+@pytest.mark.parametrize("code", [errno.EXDEV, errno.EPERM, errno.EMLINK])
+def test_copied_where_there_are_no_links(folder, other, monkeypatch, code):
+    def no_links(source, target):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "link", no_links)
+    made = folder.run("sum", refused, options=OPTIONS)
+    assert contents(made) == contents(other.root / "sum")
+    assert not (made / "sum.txt").samefile(other.root / "sum" / "sum.txt")
+
+
+@pytest.mark.parametrize("n_links", range(4))
+def test_killed_in_between_it_is_taken_over_whole(folder, other, monkeypatch, n_links):
+    links, link = [], os.link
+
+    def killed(source, target):
+        if len(links) == n_links:
+            raise KeyboardInterrupt
+        links.append(target)
+        link(source, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "link", killed)
+        with pytest.raises(KeyboardInterrupt):
+            folder.run("sum", refused, options=OPTIONS)
+    assert not (folder.root / "sum").exists()
+    # Without the other folder there is nothing whole to take; with it, all of it is.
+    alone = StageFolder(shutil.copytree(folder.root, folder.root.parent / "alone"))
+    alone.run("sum", write_sum, options=OPTIONS)
+    assert not alone.records[0].reused
+    made = folder.run("sum", refused, options=OPTIONS)
+    assert contents(made) == contents(other.root / "sum")
+
+
+def test_killed_before_it_takes_its_place_it_is_whole(folder, other, monkeypatch):
+    def killed(partial, target):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("reflfield.stages.take_place", killed)
+        with pytest.raises(KeyboardInterrupt):
+            folder.run("sum", refused, options=OPTIONS)
+    again = StageFolder(folder.root)
+    assert contents(again.run("sum", refused, options=OPTIONS)) == contents(other.root / "sum")
+
+
+def test_an_unfinished_stage_is_not_taken_over(folder, other):
+    (other.root / "sum" / RECORD).unlink()
+    folder.run("sum", write_sum, options=OPTIONS)
+    assert not folder.records[0].reused
+
+
+def test_computed_again_it_is_taken_over_only_if_that_was_just_done(other, tmp_path):
+    stale = StageFolder(tmp_path / "own", {"sum"}, also=[other])
+    stale.run("sum", write_sum, options=OPTIONS)
+    assert not stale.records[0].reused
+    StageFolder(tmp_path / "own").run("sum", refused, options=OPTIONS)
+    fresh = StageFolder(tmp_path / "other", {"sum"})
+    fresh.run("sum", write_sum, options=OPTIONS)
+    own = StageFolder(tmp_path / "own", {"sum"}, also=[fresh])
+    made = own.run("sum", refused, options=OPTIONS)
+    assert (made / "sum.txt").samefile(fresh.root / "sum" / "sum.txt")
+    assert not own.records[0].reused
