@@ -354,9 +354,13 @@ def pipeline_options(config: Path | None, settings: list[str]) -> Any:
 
 def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
+    from reflfield.steps.choices import words_of
+
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
         say(f"{record.name:<18}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
+    for words in words_of(job):
+        say(words)
     metrics = job.out / "metrics.json"
     if metrics.is_file() and any(r.name == "report" for r in job.stages.records):
         say_metrics(json.loads(metrics.read_text()))

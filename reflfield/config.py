@@ -42,9 +42,11 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected TOML, received something else: {error}") from error
 
 
-def write_toml(path: Path, options: Any) -> None:
-    """Write nested option dataclasses; what is None is left out."""
-    path.write_text(tomli_w.dumps(_without_none(dataclasses.asdict(options))), encoding="utf-8")
+def write_toml(path: Path, options: Any, notes: Iterable[str] = ()) -> None:
+    """Write nested option dataclasses, below notes; what is None is left out."""
+    comments = "".join(f"# {note}\n" for note in notes)
+    tables = tomli_w.dumps(_without_none(dataclasses.asdict(options)))
+    path.write_text(comments + tables, encoding="utf-8")
 
 
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:

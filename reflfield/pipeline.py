@@ -15,8 +15,16 @@ from typing import Any
 from reflfield.capture.model import Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
+from reflfield.progress import report
 from reflfield.stages import only_run
-from reflfield.steps import evaluation, outputs, rate_distortion, reflectance, surface
+from reflfield.steps import (
+    choices,
+    evaluation,
+    outputs,
+    rate_distortion,
+    reflectance,
+    surface,
+)
 from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
@@ -38,7 +46,7 @@ class Stage:
     reads : callable
         Digests of what it reads besides.
     wanted : callable
-        Whether the options ask for it.
+        Whether the job asks for it.
     """
 
     name: str
@@ -46,17 +54,39 @@ class Stage:
     after: tuple[str, ...] = ()
     options: Callable[[PipelineOptions], Any] = lambda options: None
     reads: Callable[[Job], Mapping[str, str]] = lambda job: {}
-    wanted: Callable[[PipelineOptions], bool] = lambda options: True
+    wanted: Callable[[Job], bool] = lambda job: True
 
     def run(self, job: Job) -> None:
         """Compute the stage, or take its earlier result."""
-        before = [name for name in self.after if BY_NAME[name].wanted(job.options)]
+        before = [name for name in self.after if BY_NAME[name].wanted(job)]
         job.stages.run(
             self.name,
             lambda folder: self.compute(job, folder),
             options=self.options(job.options),
             inputs={**self.reads(job), **{name: job.stages.key(name) for name in before}},
         )
+
+
+def frames_digests(job: Job) -> dict[str, str]:
+    """Digests of the frames that fields are compared on."""
+    return {name: frames.digest() for name, frames in evaluation.frame_sets(job).items()}
+
+
+def try_candidates(job: Job, folder: Path) -> Mapping[str, Any]:
+    """Run with every way to settle what is open, up to the comparison; take the best."""
+    found = choices.candidates(job)
+    tried: list[tuple[choices.Candidate, Job]] = []
+    for i, candidate in enumerate(found):
+        report(f"trial of {candidate.name}", i, len(found))
+        folders = [job.stages, *(trial.stages for _, trial in tried)]
+        trial = choices.trial_of(job, candidate, folders)
+        for stage in ORDER[: STAGES.index("comparison") + 1]:
+            if stage.wanted(trial):
+                stage.run(trial)
+        choices.keep_comparison(trial, candidate, folder)
+        tried.append((candidate, trial))
+    job.stages.also = tuple(trial.stages for _, trial in tried)
+    return choices.conclude(folder, tried)
 
 
 ORDER = (
@@ -94,6 +124,22 @@ ORDER = (
         reflectance.write_observations,
         after=("visibility",),
         reads=lambda job: {"photographs": job.training.digest(("photographs",))},
+    ),
+    # what is open is settled by trials on the held-out frames
+    Stage(
+        choices.STAGE,
+        try_candidates,
+        after=("observations",),
+        options=lambda options: (
+            options.completion,
+            options.resampling,
+            options.alignment,
+            options.compression,
+            options.relighting,
+            options.seed,
+        ),
+        reads=lambda job: {"name": job.capture.name, **frames_digests(job)},
+        wanted=choices.is_open,
     ),
     # scattered directions -> common grid; missing samples filled
     Stage(
@@ -135,7 +181,7 @@ ORDER = (
         after=("compression",),
         options=lambda options: (options.compression, options.resampling, options.seed),
         reads=lambda job: {"name": job.capture.name},
-        wanted=lambda options: options.compares_without_alignment,
+        wanted=lambda job: job.options.compares_without_alignment,
     ),
     # held-out photographs against the fields relit from their cameras
     Stage(
@@ -143,7 +189,7 @@ ORDER = (
         evaluation.write_comparison,
         after=("compression", "without_alignment"),
         options=lambda options: options.relighting,
-        reads=lambda job: {n: f.digest() for n, f in evaluation.frame_sets(job).items()},
+        reads=frames_digests,
     ),
     # what bits bring: the models quantised more and more coarsely
     Stage(
@@ -151,11 +197,16 @@ ORDER = (
         rate_distortion.write_rate_distortion,
         after=("compression", "without_alignment"),
         options=lambda options: options.relighting,
-        reads=lambda job: {n: f.digest() for n, f in evaluation.frame_sets(job).items()},
-        wanted=lambda options: options.shows_rate_distortion,
+        reads=frames_digests,
+        wanted=lambda job: job.options.shows_rate_distortion,
     ),
     # everything that was found, in one page
-    Stage("report", outputs.write_report_page, after=("comparison", "rate_distortion")),
+    Stage(
+        "report",
+        outputs.write_report_page,
+        after=("choices", "comparison", "rate_distortion"),
+        reads=lambda job: {f"choice {i}": text for i, text in enumerate(choices.words_of(job))},
+    ),
 )
 STAGES = tuple(stage.name for stage in ORDER)
 BY_NAME = {stage.name: stage for stage in ORDER}
@@ -216,12 +267,23 @@ def run(
         redo,
     )
     check_memory(job)
+    choices.check_choices(job)
     with only_run(job.stages.root):
         for stage in ORDER[: len(wanted)]:
-            if stage.wanted(job.options):
+            if stage.name == choices.STAGE:
+                if last == choices.STAGE or choices.first_affected(job) in wanted:
+                    job = settled(job)
+            elif stage.wanted(job):
                 stage.run(job)
         outputs.publish(job)
     return job
+
+
+def settled(job: Job) -> Job:
+    """The job with nothing left open, by trials where there is something to try."""
+    if choices.is_open(job):
+        BY_NAME[choices.STAGE].run(job)
+    return choices.decided(job)
 
 
 def _number(option: str, name: str) -> int:

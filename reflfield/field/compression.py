@@ -38,9 +38,10 @@ class CompressionOptions:
         Clusters, and basis functions of each beside its mean.
     fit : {"auto", "samples", "grid"}
         "grid": local PCA of the resampled texels, as in the paper. "samples": from there,
-        mean, basis and coefficients are fitted to the samples themselves. "auto" fits to
-        the samples where a texel has several of them for each coefficient, but not
-        thousands.
+        mean, basis and coefficients are fitted to the samples themselves. "auto" makes
+        both fields and takes the one that is clearly better on the held-out frames. Without
+        any, in doubt, or where a texel has thousands of samples, their number decides: see
+        `fits_samples`.
     rank : int
         Rank of the completion in the aligned frames.
     training_texels : int

@@ -57,9 +57,10 @@ class ResamplingOptions:
         What is applied to samples before they are resampled and factored.
     smoothness : float
         Weight of the squared differences between neighbouring nodes against one sample.
-    visibility : {"factored", "kept"}
+    visibility : {"factored", "kept", "auto"}
         "factored": samples in cast shadow do not count and shadows are traced again when
-        rendering. "kept": shadows are part of the data, as in the paper.
+        rendering. "kept": shadows are part of the data, as in the paper. "auto" makes both
+        fields and keeps the shadows if that is clearly better on the held-out frames.
     """
 
     view_side: int = 0
@@ -77,9 +78,10 @@ class ResamplingOptions:
             raise InputError(f"domain: expected one of {known}, received {self.domain!r}")
         if not self.smoothness > 0:
             raise InputError(f"smoothness: expected > 0, received {self.smoothness}")
-        if self.visibility not in ("factored", "kept"):
+        if self.visibility not in ("factored", "kept", "auto"):
             raise InputError(
-                f"visibility: expected 'factored' or 'kept', received {self.visibility!r}"
+                "visibility: expected 'factored', 'kept' or 'auto', received "
+                f"{self.visibility!r}"
             )
 
 

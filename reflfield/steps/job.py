@@ -25,6 +25,8 @@ from reflfield.steps.options import PipelineOptions
 
 # Held-out frames are rendered and shown: more than this many say nothing new.
 MOST_HELD_FRAMES = 64
+# What an option says that is decided by comparison.
+AUTO = "auto"
 # In the folder of the observations: the samples, or the name of the place where they are.
 SAMPLES, ELSEWHERE = RESTARTABLE[0], "samples.location"
 
@@ -44,6 +46,10 @@ class Job:
     resources : Resources
     redo : set of str
         Stages to compute again.
+    asked : PipelineOptions, optional
+        With "auto" where `options` say what it has come to; None before that.
+    folders : StageFolder, optional
+        Of the stages; by default, new ones in `out`.
     """
 
     capture: Capture
@@ -52,11 +58,18 @@ class Job:
     hold_out: HoldOut = field(default_factory=HoldOut)
     resources: Resources = field(default_factory=Resources)
     redo: frozenset[str] = frozenset()
+    asked: PipelineOptions | None = None
+    folders: StageFolder | None = None
 
     @cached_property
     def stages(self) -> StageFolder:
         """Folders of the stages."""
-        return StageFolder(self.out / "stages", set(self.redo))
+        return self.folders or StageFolder(self.out / "stages", set(self.redo))
+
+    @property
+    def asked_options(self) -> PipelineOptions:
+        """Options as they were asked for, "auto" included."""
+        return self.asked or self.options
 
     @cached_property
     def scheduler(self) -> Scheduler:
@@ -160,14 +173,22 @@ class Job:
         return load_arrays(self.stages.root / "visibility" / "visibility.npz")["lights"]
 
     @property
-    def visibility_kind(self) -> str:
-        """Whether shadows are "kept" in the data or "factored" out.
+    def casts_shadows(self) -> bool:
+        """Whether shadows could be traced: not of a flat base surface or unknown lights."""
+        return self.capture.lights_known and not self.is_plane
 
-        A flat base surface and unknown light cast no shadow that could be traced.
-        """
-        if self.is_plane or not self.capture.lights_known:
+    @property
+    def visibility_kind(self) -> str:
+        """Whether shadows are "kept" in the data or "factored" out."""
+        if not self.casts_shadows:
             return "kept"
-        return self.options.resampling.visibility
+        asked = self.options.resampling.visibility
+        if asked == AUTO:
+            raise InputError(
+                "resampling.visibility: expected 'kept' or 'factored' after the stage "
+                "'choices', received 'auto'; settle it with reflfield.steps.choices.decided"
+            )
+        return asked
 
     @cached_property
     def observed(self) -> Observed:

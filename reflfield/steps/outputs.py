@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from reflfield.capture.images import encode_srgb, write_exr
 from reflfield.comparison import sections
-from reflfield.comparison.heldout import mean_sample
-from reflfield.comparison.metrics import Comparison
+from reflfield.comparison.heldout import RelitPairs, mean_sample
+from reflfield.comparison.metrics import Comparison, compare_frames
 from reflfield.comparison.pictures import texture
 from reflfield.comparison.report import ReportContent, Section, write_report
 from reflfield.comparison.truth import open_truth
@@ -27,7 +27,7 @@ from reflfield.files import replacing
 from reflfield.geometry.visibility import RayScene
 from reflfield.observations.store import ObservationStore
 from reflfield.stages import plain, versions
-from reflfield.steps import evaluation
+from reflfield.steps import choices, evaluation
 from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
 from reflfield.steps.rate_distortion import stored_points
@@ -66,7 +66,7 @@ def publish(job: Job) -> None:
     with replacing(job.out / "timings.json") as partial:
         partial.write_text(json.dumps(timings(job), indent=1) + "\n")
     with replacing(job.out / "options.toml") as partial:
-        write_toml(partial, job.options)
+        write_toml(partial, job.asked_options, list(choices.words_of(job)))
 
 
 def timings(job: Job) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def timings(job: Job) -> dict[str, Any]:
     records = [plain(asdict(record)) for record in job.stages.records]
     return {
         "stages": records,
-        "seconds": sum(record["seconds"] for record in records),
+        "seconds": choices.total_seconds(job),
         "peak_bytes": max((record["peak_bytes"] for record in records), default=0),
         "workers": job.resources.workers,
         "max_memory": job.resources.max_memory,
@@ -166,6 +166,7 @@ def report_content(
     main = compared.get("heldout") or compared.get("truth")
     parts = [
         *_frames_sections(job, compared),
+        *_choices_sections(job),
         *_ablation_sections(job, compared),
         *_rate_sections(job),
         *_surface_sections(job, field, average),
@@ -185,7 +186,7 @@ def report_content(
             main,
             file_bytes=size,
             raw_bytes=raw_bytes(job),
-            seconds=sum(record.seconds for record in job.stages.records),
+            seconds=choices.total_seconds(job),
         ),
         sections=tuple(parts),
         warnings=tuple(warnings_of(job)),
@@ -280,18 +281,53 @@ def _ablation_sections(job: Job, compared: dict[str, Comparison | None]) -> Iter
         found = compared
         if variant != evaluation.MAIN:
             found = {n: evaluation.comparison_of(job, n, variant) for n in compared}
-        known = {FRAME_TITLES[n][0]: c for n, c in found.items() if c is not None}
-        variants.append(
-            sections.FieldVariant(
-                names[variant],
-                known,
-                counts[stage]["field bytes"],
-                counts[stage]["relative error of the samples"],
-                counts[stage]["relative error of their cube roots"],
-            )
-        )
+        variants.append(_variant(names[variant], found, counts[stage]))
         pairs.append(next(iter(evaluation.relit_pairs(job, variant).values()), ()))
     yield sections.ablation_section(variants, pairs)
+
+
+def _choices_sections(job: Job) -> Iterator[Section]:
+    """What was "auto", if anything was: what it has come to, and what was tried."""
+    words = list(choices.words_of(job))
+    if not words:
+        return
+    if not choices.is_open(job):
+        yield sections.rules_section(words)
+        return
+    found, records = choices.outcome(job), choices.trial_records(job)
+    tried, pairs = [], []
+    for candidate in found.tried:
+        folder = job.stages.root / choices.STAGE / candidate.name
+        pairs.append(RelitPairs(job.held_frames, folder / "heldout"))
+        tried.append(
+            sections.TriedField(
+                _variant(
+                    candidate.name,
+                    {"heldout": compare_frames(pairs[-1])},
+                    json.loads((folder / "field.json").read_text()),
+                ),
+                seconds=sum(r["seconds"] for r in records[candidate.name]),
+                unseen=_mean_of(folder / "truth.json"),
+            )
+        )
+    yield sections.choices_section(tried, found.taken.name, words, pairs)
+
+
+def _mean_of(metrics: Path) -> dict[str, float] | None:
+    return json.loads(metrics.read_text())["mean"] if metrics.is_file() else None
+
+
+def _variant(
+    name: str, compared: dict[str, Comparison | None], counts: dict[str, Any]
+) -> sections.FieldVariant:
+    """A field as the sections take it that compare several."""
+    return sections.FieldVariant(
+        name,
+        {FRAME_TITLES[n][0]: c for n, c in compared.items() if c is not None},
+        counts["field bytes"],
+        counts["relative error of the samples"],
+        counts["relative error of their cube roots"],
+    )
 
 
 def _rate_sections(job: Job) -> Iterator[Section]:

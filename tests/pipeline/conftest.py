@@ -56,6 +56,7 @@ band_limit = 4
 iterations = 1
 n_clusters = 1
 [compression]
+fit = "samples"
 n_clusters = 2
 n_components = 2
 rank = 4

@@ -6,6 +6,11 @@ leaves out those whose input a run does not have.
 
 from reflfield.comparison.sections.ablation import FieldVariant, ablation_section
 from reflfield.comparison.sections.accounts import Account, accounts_section
+from reflfield.comparison.sections.choices import (
+    TriedField,
+    choices_section,
+    rules_section,
+)
 from reflfield.comparison.sections.frames import (
     alignment_section,
     comparisons_table,
@@ -38,10 +43,12 @@ __all__ = [
     "RatePoint",
     "SilhouetteView",
     "StageRecord",
+    "TriedField",
     "ablation_section",
     "accounts_section",
     "alignment_section",
     "atlas_section",
+    "choices_section",
     "comparisons_table",
     "compression_section",
     "coverage_section",
@@ -50,6 +57,7 @@ __all__ = [
     "metrics_table",
     "normals_section",
     "rate_distortion_section",
+    "rules_section",
     "run_section",
     "silhouettes_section",
     "stages_section",

@@ -30,6 +30,8 @@ from reflfield.errors import InputError
 
 # Fields whose files differ by less than this share count as equal in size.
 EQUAL_SIZE = 0.02
+# Width of a picture where the fields are too many for one row.
+WRAPPED_WIDTH = 260
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,8 @@ def ablation_section(
         raise InputError(f"variants: expected two at least, received {len(variants)}")
     items: list[Item] = [_errors_table(variants)]
     if variants[0].comparisons:
-        items += [_metrics_table(variants), _strip(variants, pairs)]
+        advice = "Look at the highlights and at fine relief: without alignment they smear."
+        items += [_metrics_table(variants), middle_frame(variants, pairs, advice)]
     sizes = [variant.file_bytes for variant in variants]
     if max(sizes) > (1 + EQUAL_SIZE) * min(sizes):
         words = "; ".join(f"{v.name} {format_bytes(v.file_bytes)}" for v in variants)
@@ -124,8 +127,20 @@ def _metrics_table(variants: Sequence[FieldVariant]) -> Table:
     )
 
 
-def _strip(variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]]) -> Figure:
-    """The frame whose gain in FLIP is the middle one, from all variants."""
+def middle_frame(
+    variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]], advice: str
+) -> Figure:
+    """The frame whose gain in FLIP, first over second, is the middle one, from all variants.
+
+    Parameters
+    ----------
+    variants : sequence of FieldVariant
+        Two at least, with comparisons.
+    pairs : sequence of iterable of FramePair
+        Of each variant, the frames of its first comparison in that order.
+    advice : str
+        What to look at.
+    """
     compared = [next(iter(variant.comparisons.values())) for variant in variants]
     flips = np.array([[frame.flip for frame in c.frames] for c in compared])
     gains = flips[1] - flips[0]
@@ -147,11 +162,10 @@ def _strip(variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]
             *(Panel(row.relit, name) for name, row in named),
             *(Panel(error_panel(row, high), f"FLIP error {name}") for name, row in named),
         ),
-        f"The frame with the middle gain of all. {metrics}. Look at the highlights and at fine "
-        "relief: without alignment they smear.",
+        f"The frame with the middle gain of all. {metrics}. {advice}",
         title=rows[0].metrics.name,
         colour_bar=ColourBar("magma", 0.0, high, "FLIP error: 0 is not distinguishable"),
-        min_width=0,
+        min_width=0 if len(variants) == 2 else WRAPPED_WIDTH,
     )
 
 
