@@ -1,5 +1,7 @@
 """Section builders: the numbers they print, and input that lacks something."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,6 +90,40 @@ def test_fields_of_other_size_are_not_compared_in_silence(rng, samples):
     assert [panel.label for panel in strip.panels][:3] == ["photograph", "ours", "other"]
     # All gains are equal: the middle one of three.
     assert strip.title == "heldout_001"
+
+
+def test_fields_that_were_tried_stand_beside_the_photograph(rng, samples):
+    pairs = samples.frame_pairs(rng, count=3, size=24)
+    worse = [replace(pair, relit=0.5 * pair.relit) for pair in pairs]
+    frames = {"a": worse, "b": pairs, "c": worse}
+    tried = [
+        sections.TriedField(
+            sections.FieldVariant(name, {"held out": compare_frames(some)}, 1000, 0.1234, 0.05),
+            seconds=75.0,
+            unseen=None if name == "c" else compare_frames(some).mean,
+        )
+        for name, some in frames.items()
+    ]
+
+    def section(n):
+        return sections.choices_section(tried[:n], "b", ["Why."], list(frames.values())[:n])
+
+    (compared,) = tables(section(3))
+    best = f"{compare_frames(pairs).mean['psnr_ldr']:.2f}"
+    assert [row[0] for row in compared.rows] == ["a", "b", "c"]
+    assert compared.rows[1][1] == best
+    assert [row[4] for row in compared.rows] == ["0 of 3", "3 of 3", "0 of 3"]
+    assert compared.rows[0][5:] == ("12.34", "1 kB", "1 min 15 s")
+    assert compared.emphasised == (1,)
+    # Of unseen frames only where all fields were measured on them.
+    assert [row[1] == best for row in tables(section(2))[1].rows] == [False, True]
+    (strip,) = [item for item in section(3).items if isinstance(item, Figure)]
+    assert [panel.label for panel in strip.panels][:4] == ["photograph", "b", "a", "c"]
+
+
+def test_what_was_taken_is_among_what_was_tried():
+    with pytest.raises(InputError, match=r"tried: .* 'b' among them"):
+        sections.choices_section([], "b", [], [])
 
 
 def test_a_comparison_needs_two_fields():
