@@ -12,6 +12,7 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NoReturn
 
@@ -156,8 +157,9 @@ class ClusterWork:
             self.begun += 1
 
     def _usable(self, future: distributed.Future, result: Any) -> Any:
-        if future.status == "finished":
-            return result
+        # Whatever has become of the future meanwhile: its worker may have died since.
+        if isinstance(result, _Computed):
+            return result.value
         if future.status != "error":
             self._lost(None)
         _, error, traceback = result
@@ -214,6 +216,13 @@ class _Workers:
         self._waited = seconds > 0
 
 
+@dataclass(frozen=True)
+class _Computed:
+    """What a worker has computed, told apart from what dask puts in the place of it."""
+
+    value: Any
+
+
 @lru_cache(maxsize=1)
 def _limit_worker() -> None:
     """Give the BLAS of a cluster's worker one thread, for good: its tasks overlap."""
@@ -225,7 +234,7 @@ def _on_worker(
 ) -> Any:
     distributed.get_worker().log_event(TOPIC, token)
     _limit_worker()
-    return function(context, block)
+    return _Computed(function(context, block))
 
 
 def _same(context: Any) -> Any:

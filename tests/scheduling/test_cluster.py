@@ -1,6 +1,7 @@
 """Blocks on a cluster whose workers, or scheduler, die: what is lost, and what is said."""
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -72,6 +73,28 @@ def test_what_a_worker_has_computed_is_not_lost_with_it(tmp_path, cluster):
     assert 1 <= repeated <= 2 * BLOCKS_PER_THREAD
 
 
+def test_what_has_arrived_is_not_lost_with_the_worker_that_sent_it(processes):
+    """A result that waits to be kept while its worker dies, and dask gives it up for lost."""
+    cluster = processes()
+    cluster.add_workers(1, nanny=True)
+    kept = {}
+
+    def process_of(context, block):
+        return {"process": np.array(os.getpid())}
+
+    def keep(number, result):
+        kept[number] = int(result["process"])
+        if len(kept) == 1:
+            time.sleep(0.5)  # for the next result to arrive
+            os.kill(kept[number], signal.SIGKILL)
+            time.sleep(0.5)  # for its loss to be noticed
+
+    blocks = {n: n for n in range(4)}
+    Scheduler(1, cluster.address).run(process_of, None, blocks, keep)
+    assert sorted(kept) == [0, 1, 2, 3]
+    assert kept[0] == kept[1] != kept[2]
+
+
 def test_no_worker_left(tmp_path, processes, monkeypatch):
     """The run says that it waits, then why it ends; the next goes on from its blocks."""
 
@@ -90,13 +113,14 @@ def test_no_worker_left(tmp_path, processes, monkeypatch):
         pytest.raises(InputError, match=r"expected workers at tcp.* found none for 3 s; start"),
     ):
         blocks.map("work", dies, str(tmp_path), range(8))
-    assert (f"waiting for workers of {cluster.address}", 2, 3) in heard
+    waiting = f"waiting for workers of {cluster.address}"
+    assert {(waiting, 1, 3), (waiting, 2, 3)} & set(heard)
     kept = list((tmp_path / "blocks" / "work").iterdir())
     assert all(path.name.endswith(".block") for path in kept)
 
     # A worker that comes while it is waited for does what is left.
     def start_worker(description, done, total):
-        if description.startswith("waiting") and done == 1 and not started:
+        if description.startswith("waiting") and not started:
             started.append(cluster.start("worker", cluster.address, "--no-dashboard"))
 
     monkeypatch.undo()
