@@ -290,7 +290,9 @@ def _compared(job: Job) -> str:
     psnr = record.counts["heldout PSNR, dB"] if record is not None else {}
     found = ", ".join(f"{name} {value:.2f} dB" for name, value in psnr.items())
     n_frames = len(job.held_frames.photographs)
-    return f"mean LDR PSNR of the held-out frames ({n_frames}) is {found}"
+    taken = outcome(job).taken.name
+    doubt = "" if taken == max(psnr, key=psnr.__getitem__) else "; what is higher, is by chance"
+    return f"mean LDR PSNR of the held-out frames ({n_frames}) is {found}{doubt}"
 
 
 def _rule(job: Job) -> str:

@@ -168,6 +168,9 @@ class TestWhatATrialLeaves:
         shadows, fit = records(tried)["choices"]["counts"]["taken"].split("-")
         assert f'resampling.visibility = "auto" took "{shadows}"' in notes[0]
         assert f'compression.fit = "auto" took "{fit}"' in notes[1]
+        psnr = records(tried)["choices"]["counts"]["heldout PSNR, dB"]
+        in_doubt = psnr[f"{shadows}-{fit}"] < max(psnr.values())
+        assert [note.endswith("by chance.") for note in notes] == [in_doubt, in_doubt]
         used = with_tables(PipelineOptions(), read_toml(tried / "options.toml"))
         assert (used.resampling.visibility, used.compression.fit) == ("auto", "auto")
 
