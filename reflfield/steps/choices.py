@@ -100,8 +100,8 @@ def _fits(job: Job, visibility: str) -> tuple[str, ...]:
     """The fit that the number of samples speaks for, then the other if it is to be tried.
 
     The field on the grid is where the fit to the samples starts, and takes seconds. The fit
-    to the samples is not tried where a texel has so many that those of enough texels would
-    not fit in memory.
+    to the samples is not tried where a texel has fewer than it has coefficients, or so many
+    that those of enough texels would not fit in memory.
     """
     options = job.asked_options.compression
     if options.fit != AUTO:
@@ -109,7 +109,13 @@ def _fits(job: Job, visibility: str) -> tuple[str, ...]:
     settled = Candidate(visibility, AUTO).settled(job.asked_options)
     n = samples_per_texel(replace(job, options=settled))
     found = ("samples", "grid") if options.fits_samples(n) else ("grid", "samples")
-    return found if job.held_frames.photographs and n <= MOST_SAMPLES else found[:1]
+    compared = len(job.held_frames.photographs) > 0 and can_fit_samples(job, n)
+    return found if compared else found[:1]
+
+
+def can_fit_samples(job: Job, n_samples: float) -> bool:
+    """Whether the fit to so many samples of a texel is determined, and they fit in memory."""
+    return job.asked_options.compression.n_components <= n_samples <= MOST_SAMPLES
 
 
 def samples_per_texel(job: Job) -> float:
@@ -300,5 +306,7 @@ def _rule(job: Job) -> str:
     n = samples_per_texel(job)
     if n > MOST_SAMPLES:
         return f"{n:.0f} samples per texel make the grids dense, and are too many to fit to"
+    if not can_fit_samples(job, n):
+        return f"{n:.0f} samples per texel are fewer than coefficients"
     enough = "enough" if job.options.compression.fit == "samples" else "too few"
     return f"no frames are held out, and {n:.0f} samples per texel are {enough}"

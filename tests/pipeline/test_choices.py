@@ -46,7 +46,7 @@ def killed(*arguments):
 evaluation.compare_with_photographs = killed
 cli.main()
 """
-# Of a texel six samples count on average, less than eight; with shadows, more.
+# Of a texel five samples count on average, less than eight; with shadows, more.
 NAMES = ["factored-grid", "factored-samples", "kept-samples", "kept-grid"]
 
 
@@ -280,16 +280,29 @@ class TestCandidates:
     def names(self, job):
         return [candidate.name for candidate in choices.candidates(job)]
 
+    def with_components(self, job, n_components):
+        compression = replace(job.options.compression, n_components=n_components)
+        return replace(job, options=replace(job.options, compression=compression))
+
     def test_what_the_samples_speak_for_comes_first(self, job):
         assert self.names(job) == NAMES
-        many = replace(job.options.compression, n_components=500)
-        scarce = replace(job, options=replace(job.options, compression=many))
-        assert self.names(scarce) == [
+        assert self.names(self.with_components(job, 4)) == [
             "factored-grid",
             "factored-samples",
             "kept-grid",
             "kept-samples",
         ]
+
+    def test_fewer_samples_than_coefficients_are_not_fitted_to(self, job, tiny_options):
+        assert [c.fit for c in choices.candidates(self.with_components(job, 50))] == [
+            "grid",
+            "grid",
+        ]
+        fit = options_of(tiny_options, OPEN[1], "compression.n_components=50")
+        alone = choices.decided(replace(job, options=fit))
+        assert alone.options.compression.fit == "grid"
+        (words,) = choices.words_of(alone)
+        assert '"auto" took "grid": 5 samples per texel are fewer than coefficients.' in words
 
     def test_one_choice_has_the_names_of_its_own(self, job, tiny_options):
         fit = replace(job, options=options_of(tiny_options, OPEN[1]))
