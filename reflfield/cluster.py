@@ -1,8 +1,9 @@
 """Blocks on the workers of a dask cluster, which may come, go and die meanwhile.
 
-The cluster has only a few blocks in hand for each thread of its workers, and their results
-are fetched and kept as they arrive. So what dies with a worker is what it was at, and not
-all that it has computed; dask gives that to another worker.
+Each worker has only a few blocks in hand for each of its threads, and their results are
+fetched and kept as they arrive. So what dies with a worker is what it was at, and not all
+that it has computed; that is given to the others. No worker needs what another one has:
+fetching from one that dies can leave dask's workers and scheduler waiting for each other.
 """
 
 from __future__ import annotations
@@ -10,26 +11,29 @@ from __future__ import annotations
 import time
 import uuid
 import warnings
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NoReturn
 
+import cloudpickle
 import distributed
 from threadpoolctl import ThreadpoolController
 
 from reflfield.errors import InputError
 from reflfield.progress import report
 
-# How often a block is tried again that failed. One whose worker died is tried again as often
-# as the scheduler's `allowed-failures` say.
+# How often a block is tried again that failed, and how many workers may die with the same
+# one in hand: it may be what kills them.
 RETRIES = 3
+MOST_DEATHS = 4
 CONNECTING_SECONDS = 30
 CLOSING_SECONDS = 5
 # How long a run waits, saying so, while a cluster has no worker.
 WAITING_SECONDS = 300
-# Blocks in hand for each thread of the workers: one that is computed, and the next.
+# Blocks in hand for each thread of a worker: one that is computed, and the next.
 BLOCKS_PER_THREAD = 2
 POLLING_SECONDS = 0.02
 COUNTING_SECONDS = 1.0
@@ -63,7 +67,11 @@ class ClusterWork:
         self.begun = 0
         self._address, self._function, self._context = address, function, context
         self._token = uuid.uuid4().hex
-        self._number_of: dict[Any, int] = {}
+        self._left: deque[int] = deque()
+        # Address of the worker and number of the block that a future is of.
+        self._in_hand: dict[Any, tuple[str, int]] = {}
+        self._contexts: dict[str, Any] = {}
+        self._deaths: Counter[int] = Counter()
         self._workers = _Workers(address)
 
     def results(self, blocks: Mapping[int, Any]) -> Iterator[tuple[int, Any]]:
@@ -77,31 +85,27 @@ class ClusterWork:
             If the scheduler does not answer, or is lost; if the workers are, and no other
             comes; if one block is the death of several.
         """
-        left = iter(blocks.items())
+        self._left.extend(blocks)
+        n_kept = 0
         with self._connected() as client:
             finished = distributed.as_completed(with_results=True, raise_errors=False)
             with self._needing_the_scheduler():
                 client.subscribe_topic(TOPIC, self._hear)
-                # One large argument, sent once; as a task it outlives the worker that has it.
-                shared = client.submit(_same, self._context, pure=False, retries=RETRIES)
-            n_kept = 0
             while n_kept < len(blocks):
                 with self._needing_the_scheduler():
-                    self._check(client, shared)
-                    for number, block in self._next(left, client):
-                        future = client.submit(
-                            *(_on_worker, self._function, shared, block, self._token),
-                            pure=False,
-                            retries=RETRIES,
-                        )
-                        self._number_of[future] = number
-                        finished.add(future)
+                    self._check(client)
+                    threads = self._workers.threads(client)
+                    if not finished.has_ready():
+                        self._take_back_of_lost(threads)
+                    finished.update(self._hand_out(client, threads, blocks))
                 if not finished.has_ready():
                     time.sleep(POLLING_SECONDS)
                     continue
                 future, result = next(finished)
-                yield self._number_of.pop(future), self._usable(future, result)
-                n_kept += 1
+                if future in self._in_hand:  # not taken back
+                    address, number = self._in_hand.pop(future)
+                    yield number, self._usable(future, result, address)
+                    n_kept += 1
 
     @contextmanager
     def _connected(self) -> Iterator[distributed.Client]:
@@ -116,6 +120,7 @@ class ClusterWork:
             ) from error
         try:
             with client.as_current(), warnings.catch_warnings():
+                # The context is large, and sent once to each worker.
                 warnings.filterwarnings("ignore", message="Sending large graph")
                 yield client
         finally:
@@ -136,27 +141,57 @@ class ClusterWork:
             f"it and its workers, then {GO_ON}"
         ) from error
 
-    def _check(self, client: distributed.Client, shared: distributed.Future) -> None:
+    def _check(self, client: distributed.Client) -> None:
         """Find a connection that is lost, or was and is another now: its futures are void."""
-        if client.status != "running" or shared.cancelled():
+        if client.status != "running" or any(f.cancelled() for f in self._contexts.values()):
             self._lost(None)
 
-    def _next(
-        self, left: Iterator[tuple[int, Any]], client: distributed.Client
-    ) -> Iterator[tuple[int, Any]]:
-        """Blocks to be handed out now: none while there are no workers."""
-        wanted = BLOCKS_PER_THREAD * self._workers.count_threads(client)
-        while len(self._number_of) < wanted:
-            block = next(left, None)
-            if block is None:
-                return
-            yield block
+    def _take_back_of_lost(self, threads: Mapping[str, int]) -> None:
+        """Take blocks back that workers had in hand who are not there any more."""
+        for future, (address, number) in list(self._in_hand.items()):
+            if address not in threads:
+                del self._in_hand[future]
+                future.cancel()
+                self._left.appendleft(number)
+                self._deaths[number] += 1
+                if self._deaths[number] >= MOST_DEATHS:
+                    _deadly(address)
+        for address in self._contexts.keys() - threads.keys():
+            del self._contexts[address]
+
+    def _hand_out(
+        self, client: distributed.Client, threads: Mapping[str, int], blocks: Mapping[int, Any]
+    ) -> list[distributed.Future]:
+        """Hand blocks out, to all workers one for each thread before they get the next."""
+        new = []
+        n_in_hand = Counter(address for address, _ in self._in_hand.values())
+        for each in range(1, BLOCKS_PER_THREAD + 1):
+            for address, n_threads in threads.items():
+                while self._left and n_in_hand[address] < each * n_threads:
+                    number = self._left.popleft()
+                    new.append(self._submitted(client, address, blocks[number]))
+                    self._in_hand[new[-1]] = (address, number)
+                    n_in_hand[address] += 1
+        return new
+
+    def _submitted(
+        self, client: distributed.Client, address: str, block: Any
+    ) -> distributed.Future:
+        at = {"workers": [address], "pure": False, "retries": RETRIES}
+        if address not in self._contexts:
+            self._contexts[address] = client.submit(_unpacked, self._packed, **at)
+        context = self._contexts[address]
+        return client.submit(_on_worker, self._function, context, block, self._token, **at)
+
+    @cached_property
+    def _packed(self) -> bytes:
+        return cloudpickle.dumps(self._context)
 
     def _hear(self, event: tuple[float, str]) -> None:
         if event[1] == self._token:
             self.begun += 1
 
-    def _usable(self, future: distributed.Future, result: Any) -> Any:
+    def _usable(self, future: distributed.Future, result: Any, address: str) -> Any:
         # Whatever has become of the future meanwhile: its worker may have died since.
         if isinstance(result, _Computed):
             return result.value
@@ -164,13 +199,16 @@ class ClusterWork:
             self._lost(None)
         _, error, traceback = result
         if isinstance(error, distributed.KilledWorker):
-            raise InputError(
-                f"--scheduler: expected workers that live through a block, lost "
-                f"{error.allowed_failures + 1} at the same one, the last of them "
-                f"{error.last_worker.address}; see its log, give workers more memory "
-                f"(`dask worker --memory-limit`), and {GO_ON}"
-            ) from error
+            _deadly(address)
         raise error.with_traceback(traceback)
+
+
+def _deadly(address: str) -> NoReturn:
+    raise InputError(
+        f"--scheduler: expected workers that live through a block, lost {MOST_DEATHS} at the "
+        f"same one, the last of them {address}; see its log, give workers more memory "
+        f"(`dask worker --memory-limit`), and {GO_ON}"
+    )
 
 
 class _Workers:
@@ -178,12 +216,12 @@ class _Workers:
 
     def __init__(self, address: str) -> None:
         self._address = address
-        self._n_threads = 0
+        self._threads: dict[str, int] = {}
         self._counted = self._seen = -COUNTING_SECONDS
         self._waited = False
 
-    def count_threads(self, client: distributed.Client) -> int:
-        """Threads of all workers, as of a second ago at most.
+    def threads(self, client: distributed.Client) -> dict[str, int]:
+        """Number of threads of each worker by its address, as of a second ago at most.
 
         Raises
         ------
@@ -194,12 +232,12 @@ class _Workers:
         if self._seen < 0:
             self._seen = now
         if now - self._counted >= COUNTING_SECONDS:
-            self._n_threads = sum(client.nthreads().values())
+            self._threads = dict(client.nthreads())
             self._counted = now
-            if self._n_threads:
+            if self._threads:
                 self._seen = now
             self._say(int(now - self._seen))
-        return self._n_threads
+        return self._threads
 
     def _say(self, seconds: int) -> None:
         name = f"waiting for workers of {self._address}"
@@ -237,5 +275,5 @@ def _on_worker(
     return _Computed(function(context, block))
 
 
-def _same(context: Any) -> Any:
-    return context
+def _unpacked(context: bytes) -> Any:
+    return cloudpickle.loads(context)

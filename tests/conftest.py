@@ -50,13 +50,13 @@ def rounding():
 class Processes:
     """A dask cluster of commands in processes of their own, to be killed.
 
-    The workers find the modules of `paths`; `environment` is added to that of all.
+    The workers find the modules of `paths`.
     """
 
-    def __init__(self, folder, paths, environment):
+    def __init__(self, folder, paths):
         self.folder, self.started = folder, []
         found = os.pathsep.join(filter(None, [*map(str, paths), os.environ.get("PYTHONPATH")]))
-        self.environment = {**os.environ, "PYTHONPATH": found, **environment}
+        self.environment = {**os.environ, "PYTHONPATH": found}
         named = folder / "scheduler.json"
         words = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--no-show")
         self.scheduler = self.start("scheduler", *words, "--scheduler-file", named)
@@ -119,8 +119,8 @@ def processes(tmp_path_factory):
     """Function that starts a scheduler whose workers find modules in the given folders."""
     running = []
 
-    def start(*paths, **environment):
-        running.append(Processes(tmp_path_factory.mktemp("dask"), paths, environment))
+    def start(*paths):
+        running.append(Processes(tmp_path_factory.mktemp("dask"), paths))
         return running[-1]
 
     yield start
@@ -135,7 +135,7 @@ def cluster(tmp_path_factory):
     Not a `LocalCluster`: its nannies would set the environment of this process, too, and
     what is started from it would compute with another number of threads.
     """
-    running = Processes(tmp_path_factory.mktemp("dask"), (), {})
+    running = Processes(tmp_path_factory.mktemp("dask"), ())
     try:
         running.add_workers(2, nanny=True)
         yield running.address
