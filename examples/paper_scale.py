@@ -2,12 +2,16 @@
 
     python examples/paper_scale.py OUT             # simulate, process, compress, compare
     python examples/paper_scale.py OUT --kill 5    # killed five times: the same bytes?
+    python examples/paper_scale.py OUT --kill-worker nanny    # on a cluster that loses workers
     python examples/paper_scale.py OUT --per-texel 64 128 256
 
 A vase of glaze and paint with brushed bands of gold stands in a dome. The first form prints
 seconds and peak memory of every stage; the second processes once more, kills the process
-(SIGKILL) at random moments, runs it again, and compares; the third prints what one texel
-costs at several sizes of the texture. What is done already is not done again, so the forms
+(SIGKILL) at random moments, runs it again, and compares; the third processes on a Dask
+cluster of two worker processes, kills one of them at a random moment of each stage that
+reads or writes the samples, to be started again by its nanny (or, with `alone`, kills one
+for good, and the other does the rest), and compares; the fourth prints what one texel costs
+at several sizes of the texture. What is done already is not done again, so the forms
 may follow each other. The bases are shaped by 2048 texels; all are completed and fitted.
 """
 
@@ -16,13 +20,19 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import random
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+
+import distributed
 
 SCENE = """
 effects = ["antialiasing", "near_lights", "shadows"]
@@ -52,9 +62,10 @@ points = {points}
 # Works of the stages that go texel by texel: all texels that are seen, but for those that
 # shape the basis in the first. Of the other works the number of texels is no matter.
 COMPLETING = "completing all texels"
+REFINING = "frames on the samples"
 BY_TEXELS = {
     "completion": (COMPLETING,),
-    "alignment": ("frames on the samples",),
+    "alignment": (REFINING,),
     "resampling": (COMPLETING,),
     "compression": (
         "frames against the model",
@@ -62,6 +73,9 @@ BY_TEXELS = {
         "coefficients on the samples, part 2",
     ),
 }
+
+# Stages in which a worker is killed: those that read or write the samples by blocks.
+LOSING = ("observations", "completion", "alignment", "resampling", "compression")
 
 
 def simulate(arguments: argparse.Namespace) -> Path:
@@ -171,11 +185,105 @@ def kill_and_resume(arguments: argparse.Namespace, capture: Path) -> None:
                 f"{record['name']}: {record['blocks_resumed']} blocks taken up, "
                 f"{record['blocks_computed']} computed after the last kill"
             )
+    compare(whole, out)
+
+
+def compare(whole: Path, out: Path) -> None:
+    """Print whether two runs made the same bytes; end with status 1 if not."""
     expected, found = digests(whole), digests(out)
     different = {name for name in expected | found if expected.get(name) != found.get(name)}
     print(f"{len(expected)} files compared, {len(different)} differ: {sorted(different)[:9]}")
     if different:
         sys.exit(1)
+
+
+@contextmanager
+def cluster_here(folder: Path, nanny: bool) -> Iterator[distributed.Client]:
+    """A scheduler and two workers of one thread, in processes of their own; a client."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    found = folder / "scheduler.json"
+    at = ("--scheduler-file", found.resolve(), "--no-dashboard", "--host", "127.0.0.1")
+    kind = "--nanny" if nanny else "--no-nanny"
+    commands = [("scheduler", *at, "--port", 0), *2 * [("worker", *at, kind, "--nthreads", 1)]]
+    with ExitStack() as running:
+        log = running.enter_context((folder / "log").open("w"))
+        for words in commands:
+            command = [sys.executable, "-m", "dask", *map(str, words)]
+            process = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder)
+            # Nannies end their workers when they are asked to end.
+            running.callback(process.wait)
+            running.callback(process.terminate)
+        deadline = time.monotonic() + 60
+        while not found.is_file() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        client = running.enter_context(distributed.Client(scheduler_file=str(found)))
+        client.wait_for_workers(2, timeout=60)
+        yield client
+
+
+def lose_workers(arguments: argparse.Namespace, capture: Path) -> None:
+    """Process on a cluster that loses workers, and compare with the run on threads."""
+    whole, out = arguments.out / "run", arguments.out / "cluster"
+    shutil.rmtree(out, ignore_errors=True)
+    stages = {
+        stage["name"]: stage
+        for stage in json.loads((whole / "timings.json").read_text())["stages"]
+    }
+    rng = random.Random(arguments.seed)
+    nanny = arguments.kill_worker == "nanny"
+    losing = LOSING if nanny else (rng.choice(LOSING),)
+    with cluster_here(arguments.out / "dask", nanny) as client:
+        words = process_words(arguments, capture, out, arguments.texels, 2048)
+        command = [*map(str, words), "--scheduler", client.scheduler.address]
+        running = subprocess.Popen(command, stdout=sys.stderr)
+        try:
+            lost: set[str] = set()
+            for name in losing:
+                n_kept = rng.randint(0, stages[name]["blocks_computed"] * 3 // 4)
+                lost |= kill_worker(processes(client, lost), client, running, out, name, n_kept)
+            if running.wait() != 0:
+                sys.exit(running.returncode)
+        finally:
+            running.kill()
+    for record in json.loads((out / "timings.json").read_text())["stages"]:
+        if record["blocks_computed"]:
+            print(
+                f"{record['name']}: {record['blocks_computed']} blocks, "
+                f"{record['blocks_repeated']} begun again"
+            )
+    compare(whole, out)
+
+
+def processes(client: distributed.Client, lost: set[str]) -> dict[str, int]:
+    """Processes of the workers by their addresses, when two are there that are not lost."""
+    while len(alive := set(client.nthreads()) - lost) < 2:
+        time.sleep(0.1)
+    found: dict[str, int] = client.run(os.getpid, workers=list(alive))
+    return found
+
+
+def kill_worker(
+    workers: dict[str, int],
+    client: distributed.Client,
+    running: subprocess.Popen[bytes],
+    out: Path,
+    stage: str,
+    n: int,
+) -> set[str]:
+    """Kill a worker that is at a block of a stage when so many of the stage are kept."""
+    blocks = out / "stages" / f"{stage}.partial" / "blocks"
+    while True:
+        at_work = client.processing()
+        busy = [address for address in workers if at_work.get(address)]
+        if busy and len(list(blocks.glob("*/*.block"))) >= n and blocks.is_dir():
+            os.kill(workers[busy[0]], signal.SIGKILL)
+            print(f"killed in {stage}, {n} blocks kept: worker {busy[0]}", flush=True)
+            return {busy[0]}
+        if running.poll() is not None or (out / "stages" / stage / "stage.json").is_file():
+            print(f"{stage} was over before a worker could be killed", flush=True)
+            return set()
+        time.sleep(0.01)
 
 
 def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
@@ -221,6 +329,7 @@ def main() -> None:
     parser.add_argument("--max-memory", default="6GB")
     parser.add_argument("--config", type=Path, help="further options in TOML")
     parser.add_argument("--kill", type=int, metavar="N", help="kill N times and compare")
+    parser.add_argument("--kill-worker", choices=("nanny", "alone"), help="of a Dask cluster")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--per-texel", type=int, nargs="+", metavar="SIDE")
     parser.add_argument("--training", type=int, default=512, help="texels, with --per-texel")
@@ -234,6 +343,8 @@ def main() -> None:
     processed(arguments, capture)
     if arguments.kill:
         kill_and_resume(arguments, capture)
+    if arguments.kill_worker:
+        lose_workers(arguments, capture)
 
 
 if __name__ == "__main__":

@@ -91,21 +91,26 @@ def test_effects_on_the_pipeline(subprocess_run, tiny_options, tmp_path):
     assert (tmp_path / "out" / "effects.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_paper_scale(subprocess_run, tiny_options, tmp_path):
-    small = (
-        "--rig",
-        "fibonacci",
-        "--directions",
-        12,
-        "--pixels",
-        24,
-        "--texels",
-        64,
-        "--points",
-        0,
+@pytest.fixture
+def paper_scale(tiny_options, tmp_path):
+    """Words of the script, for a small capture."""
+    return (
+        *(EXAMPLES / "paper_scale.py", tmp_path, "--rig", "fibonacci", "--directions", 12),
+        *("--pixels", 24, "--texels", 64, "--points", 0, "--config", tiny_options),
     )
-    words = (EXAMPLES / "paper_scale.py", tmp_path, *small, "--config", tiny_options)
+
+
+@pytest.mark.slow
+def test_paper_scale_on_a_cluster_that_loses_workers(subprocess_run, paper_scale):
+    done = subprocess_run(*paper_scale, "--kill-worker", "nanny")
+    assert done.status == 0, done.err
+    assert "killed in " in done.out
+    assert " 0 differ" in done.out.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_paper_scale(subprocess_run, paper_scale):
+    words = paper_scale
     done = subprocess_run(*words, "--kill", 2)
     assert done.status == 0, done.err
     lines = done.out.splitlines()
