@@ -20,6 +20,7 @@ from reflfield.stages import only_run
 from reflfield.steps import (
     choices,
     evaluation,
+    indirect,
     outputs,
     rate_distortion,
     reflectance,
@@ -131,6 +132,7 @@ ORDER = (
         try_candidates,
         after=("observations",),
         options=lambda options: (
+            options.indirect,
             options.completion,
             options.resampling,
             options.alignment,
@@ -140,6 +142,14 @@ ORDER = (
         ),
         reads=lambda job: {"name": job.capture.name, **frames_digests(job)},
         wanted=choices.is_open,
+    ),
+    # samples in shadow -> what the object shines into itself
+    Stage(
+        "indirect",
+        indirect.write_indirect,
+        after=("observations",),
+        options=lambda options: (options.indirect, options.resampling, options.seed),
+        wanted=lambda job: job.finds_indirect_light,
     ),
     # scattered directions -> common grid; missing samples filled
     Stage(
@@ -170,7 +180,7 @@ ORDER = (
     Stage(
         "compression",
         reflectance.write_compression,
-        after=("resampling",),
+        after=("resampling", "indirect"),
         options=lambda options: (options.compression, options.seed),
         reads=lambda job: {"name": job.capture.name},
     ),

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.field.indirect import IndirectLight, no_indirect_light
 from reflfield.field.model import (
     Domain,
     LightModel,
@@ -121,6 +122,8 @@ class FittedReflectance:
         Basis functions in the domain.
     domain : {"cube_root", "square_root", "linear"}
         What was applied to the samples.
+    indirect : IndirectLight, optional
+        What texels show in traced shadows; nothing, if not given.
     """
 
     local_from_world: NDArray[np.floating]
@@ -129,6 +132,7 @@ class FittedReflectance:
     mean: NDArray[np.floating]
     basis: NDArray[np.floating]
     domain: Domain = "cube_root"
+    indirect: IndirectLight | None = None
 
 
 def build_field(
@@ -278,6 +282,10 @@ def _check_reflectance(reflectance: FittedReflectance) -> None:
     check_shape("local_from_world", reflectance.local_from_world, (len(cluster), 3, 3))
     for name in ("mean", "basis", "coefficients"):
         check_finite(name, getattr(reflectance, name))
+    if reflectance.indirect is not None:
+        check_shape("indirect", reflectance.indirect.coefficients, (len(cluster), None))
+        check_finite("indirect", reflectance.indirect.functions)
+        check_finite("indirect", reflectance.indirect.coefficients)
 
 
 def _reflectance_arrays(
@@ -297,6 +305,21 @@ def _reflectance_arrays(
         "cluster": cluster.astype(np.uint8 if len(mean) <= 256 else np.uint16),
         "coefficients": smallest_codes(codes),
         "coefficient_scale": scale,
+        **_indirect_arrays(reflectance, step),
+    }
+
+
+def _indirect_arrays(reflectance: FittedReflectance, step: float) -> dict[str, NDArray[Any]]:
+    """Indirect light; its coefficients in steps, as the basis functions are of unit size."""
+    light = reflectance.indirect or no_indirect_light(len(reflectance.cluster))
+    coefficients = np.asarray(light.coefficients, np.float64)
+    # The step is a share of the means, which may be far darker.
+    step = max(step, float(np.abs(coefficients).max(initial=0.0)) * FINEST_SHARE)
+    codes = np.rint(coefficients / step)
+    return {
+        "indirect_functions": np.ascontiguousarray(light.functions, np.float32),
+        "indirect_coefficients": smallest_codes(codes.astype(np.int32)),
+        "indirect_scale": np.array([step], np.float32),
     }
 
 

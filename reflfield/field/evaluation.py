@@ -278,7 +278,8 @@ def sum_lights(
         Irradiance of a surface facing each light; for a part of an environment
         its radiance times its solid angle.
     lit : (n, m) bool, optional
-        True where light j reaches texel i; all by default.
+        True where light j reaches texel i; all by default. Where it does not, the texel shows
+        its indirect light.
 
     Returns
     -------
@@ -319,6 +320,10 @@ def sum_lights(
         reached,
         out,
     )
+    if lit is not None and not field.indirect.is_black:
+        indirect = field.indirect.under(index, lights, field.inverse_power)
+        dark = ~reached & (index >= 0)[:, None]
+        out += np.einsum("nmc,mc,nm->nc", indirect, powers, dark, optimize=True)
     return out
 
 

@@ -1,4 +1,4 @@
-"""The file of a reflectance field, `field.rfld`, version 2.
+"""The file of a reflectance field, `field.rfld`, version 3.
 
 A ZIP archive of `header.json` and one member for each array of `model.ARRAYS`, packed as
 `packing` describes. The header names format and version and, for each array, its dtype,
@@ -40,8 +40,8 @@ from reflfield.field.model import (
 from reflfield.field.packing import FILTERS, pack, unpack
 
 FORMAT_NAME = "reflfield-field"
-FORMAT_VERSION = 2
-OLDEST_VERSION = 2
+FORMAT_VERSION = 3
+OLDEST_VERSION = 3
 
 HEADER = "header.json"
 MAX_HEADER_BYTES = 16 << 20
@@ -507,6 +507,7 @@ def describe(reflectance_field: ReflectanceField) -> FieldDescription:
         "coefficients": f.coefficients,
         "mean": f.mean,
         "basis": f.basis,
+        "indirect_functions": f.indirect.functions,
     }
     return FieldDescription(
         options={
@@ -522,6 +523,7 @@ def describe(reflectance_field: ReflectanceField) -> FieldDescription:
             "texture_width": width,
             "clusters": f.n_clusters,
             "components": f.n_components,
+            "indirect_components": f.indirect.coefficients.shape[1],
             "view_side": f.view_side,
             "light_side": f.light_side,
         },

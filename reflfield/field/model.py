@@ -14,6 +14,10 @@ cosine, rounded at the horizon (`sphere.hemisphere.softened_cosine`), or 1 where
 direction of the light does not vary. It stands outside the interpolation because its
 root falls to the horizon too steeply for any grid.
 
+Where shadows were factored out, a texel that a light does not reach shows indirect light
+(`field.indirect`): a mean and a few functions of the light's direction in the world, shared by
+all texels, with coefficients of its own.
+
 Arrays are kept as they are stored, quantised (`field.transform`, `field.quantisation`);
 properties decode them when first asked for. A field opened from a file reads only what is
 used.
@@ -31,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError, ShapeError
+from reflfield.field.indirect import IndirectLight
 from reflfield.field.quantisation import (
     QuantisedBox,
     check_finite,
@@ -74,6 +79,9 @@ ARRAYS: dict[str, tuple[tuple[str, ...], tuple[str | int, ...]]] = {
     "colour_factor": (("float32",), (3, 3)),
     "core": (_CODES, ("function_rank", "view_rank", "light_rank", 3)),
     "core_scale": (("float32",), (1,)),
+    "indirect_functions": (("float32",), ("n_indirect_functions", "n_harmonics", 3)),
+    "indirect_coefficients": (_CODES, ("n_texels", "n_indirect_components")),
+    "indirect_scale": (("float32",), (1,)),
 }
 
 
@@ -164,6 +172,15 @@ class ReflectanceField:
             table = unfactor_table(self.arrays)
         return np.ascontiguousarray(np.moveaxis(table, 1, 3))
 
+    @cached_property
+    def indirect(self) -> IndirectLight:
+        """Indirect light, in the domain; see `field.indirect`."""
+        functions, scale = (self.arrays[f"indirect_{n}"] for n in ("functions", "scale"))
+        check_finite("indirect_functions", functions)
+        check_finite("indirect_scale", scale)
+        codes = self.arrays["indirect_coefficients"].astype(np.float32)
+        return IndirectLight(functions, codes * scale)
+
     @property
     def mean(self) -> NDArray[np.float32]:
         """(n_clusters, n_view_nodes, n_light_nodes, 3) float32."""
@@ -249,6 +266,12 @@ def check_arrays(declared: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[st
             f"function_factor: expected {lengths['n_components'] + 1} functions, the mean and "
             f"one a component, received {lengths['n_functions']}"
         )
+    if lengths["n_indirect_functions"] != lengths["n_indirect_components"] + 1:
+        raise ShapeError(
+            f"indirect_functions: expected {lengths['n_indirect_components'] + 1}, the mean "
+            f"and one a component, received {lengths['n_indirect_functions']}"
+        )
+    node_side("indirect_functions", lengths["n_harmonics"])
     return lengths
 
 

@@ -523,6 +523,23 @@ def _first_emptying(views: list[_View], points: Array, tolerance: int, cutoff: f
 # ---------------------------------------------------------------- surface
 
 
+def _check_inside(volume: NDArray[np.float32]) -> None:
+    """Demand that the object ends before its grid does.
+
+    Raises
+    ------
+    GeometryError
+        If it does not: no closed surface could be made of it.
+    """
+    ends = [volume.take(end, axis) for axis in range(3) for end in (0, -1)]
+    if any((end > 0.0).any() for end in ends):
+        raise GeometryError(
+            "hull: expected silhouettes that bound the object on all sides, received some that "
+            "the borders of their images cut off; leave out views that do not show the whole "
+            "object, or add views from other sides"
+        )
+
+
 def _surface(volume: NDArray[np.float32], grid: _Grid, options: HullOptions) -> Mesh:
     """Closed mesh of the zero level, cleaned as the options say."""
     if options.blur:
@@ -533,6 +550,7 @@ def _surface(volume: NDArray[np.float32], grid: _Grid, options: HullOptions) -> 
             "hull: expected an object thicker than a voxel, received one that smoothing "
             "removes; raise hull.resolution or lower hull.blur"
         )
+    _check_inside(volume)
     points, faces, _, _ = marching_cubes(volume, level=0.0, gradient_direction="ascent")
     mesh = Mesh(grid.origin + points.astype(np.float64) * grid.spacing, faces)
     mesh = keep_large_components(mesh, options.minimum_component)

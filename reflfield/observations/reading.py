@@ -17,6 +17,7 @@ from reflfield.observations.resampling import (
     above_horizon,
     local_directions,
     resample,
+    root,
     rooted_samples,
     side_for,
 )
@@ -59,6 +60,25 @@ class LocalLuminance:
     samples: Floats
     views: NDArray[np.float64]
     lights: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Shade:
+    """What some texels show where no light reaches them directly.
+
+    Parameters
+    ----------
+    values : (n, n_lights, 3) float32
+        Mean over the views, in the domain.
+    weights : (n, n_lights) float32
+        Views that show it; 0 where the light reaches the texel.
+    lights : (n, n_lights, 3) float32
+        Unit vectors, world frame.
+    """
+
+    values: Floats
+    weights: Floats
+    lights: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +185,26 @@ class TexelReader:
         if self.sides[1] == 1:
             samples, lights = _mean_over(samples, 2), _upright(len(texels))
         return LocalLuminance(samples, views, lights)
+
+    def shade(self, texels: Indices) -> Shade:
+        """Samples of some texels in the shadow of each light, averaged over the views."""
+        views = self.store.observed.views[texels]
+        _, lights = directions_of(self.capture, self.positions[texels])
+        lit = self.store.observed.lights[texels]
+        # Outside a spot's cone there is no light that could come back.
+        strong = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
+        weights = views.astype(np.float32) @ self.store.observed.pairs.astype(np.float32)
+        weights = np.where(strong & ~lit, weights, np.float32(0.0))
+        total = np.zeros((*weights.shape, 3), np.float32)
+        t, j = np.nonzero(weights)
+        pairs = self.store.observed.pairs
+        samples = self.store.read(texels)
+        for i in range(views.shape[1]):
+            used = views[t, i] & pairs[i, j]
+            rooted = root(samples[t[used], i, j[used]].astype(np.float32), self.options.domain)
+            total[t[used], j[used]] += rooted
+        means = total / np.maximum(weights, np.float32(1.0))[..., None]
+        return Shade(means.astype(np.float32), weights.astype(np.float32), lights)
 
     def nodes(self, texels: Indices) -> Nodes:
         """Texels resampled onto the nodes of their frames."""

@@ -5,7 +5,8 @@ pixel, first hits on the base mesh, the bilinear texels of each hit, and the sam
 those texels towards camera and light. Lights near enough to be points, far ones
 and spots are evaluated exactly; environment maps as a set of directional lights
 shared by all texels. Where the field was fitted without shadows
-(``visibility == "factored"``) they are traced.
+(``visibility == "factored"``) they are traced, and hits in shadow show the indirect light of
+their texels.
 """
 
 from __future__ import annotations
@@ -266,8 +267,14 @@ class Renderer:
             camera.view_directions(entries.position),
             source.directions(entries.position),
         )
-        lit_hits = entries.summed(self._lit(source, hits))
-        return samples * source.irradiance(entries.position) * lit_hits[:, None]
+        lit = self._lit(source, hits)
+        total = samples * entries.summed(lit)[:, None]
+        indirect = self.field.indirect
+        if not (indirect.is_black or lit.all()):
+            power, towards = self.field.inverse_power, source.directions(entries.position)
+            in_shadow = entries.summed(~lit)[:, None]
+            total += in_shadow * indirect.towards(entries.texel, towards, power)
+        return total * source.irradiance(entries.position)
 
     def _lit(self, light: Light, hits: SurfaceHits) -> NDArray[np.bool_]:
         """True for hits that the light reaches; all of them where shadows are in the field."""

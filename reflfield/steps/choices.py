@@ -125,7 +125,7 @@ def samples_per_texel(job: Job) -> float:
 
 def first_affected(job: Job) -> str:
     """First stage whose result depends on what is open."""
-    return "completion" if len(_visibilities(job)) > 1 else "compression"
+    return "indirect" if len(_visibilities(job)) > 1 else "compression"
 
 
 def is_open(job: Job) -> bool:

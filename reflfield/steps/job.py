@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from reflfield.capture.model import PLANE, Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
+from reflfield.field.indirect import IndirectLight
 from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
@@ -219,6 +220,24 @@ class Job:
         """Texels with at least one sample."""
         pairs = self.observed.views.astype(np.float32) @ self.observed.pairs.astype(np.float32)
         return np.flatnonzero((pairs * self.observed.lights).any(axis=1))
+
+    @cached_property
+    def texels_in_view(self) -> NDArray[np.intp]:
+        """Texels that some camera sees."""
+        return np.flatnonzero(self.view_seen.any(axis=1))
+
+    @property
+    def finds_indirect_light(self) -> bool:
+        """Whether shadows are traced, and are not to be black."""
+        return self.options.indirect.enabled and self.visibility_kind == "factored"
+
+    @property
+    def indirect_light(self) -> IndirectLight | None:
+        """What texels show in traced shadows, if anything."""
+        if not self.finds_indirect_light:
+            return None
+        stored = self.result("indirect", "indirect.npz")
+        return IndirectLight(stored["functions"], stored["coefficients"])
 
     def training_texels(self, most: int) -> NDArray[np.intp]:
         """At most so many seen texels, drawn at random, ascending."""

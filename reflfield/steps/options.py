@@ -120,6 +120,32 @@ class AlignmentOptions:
 
 
 @dataclass(frozen=True)
+class IndirectOptions:
+    """What texels show in traced shadows, where the object shines into itself.
+
+    Parameters
+    ----------
+    n_components : int
+        Functions of the light's direction beside their mean.
+    enabled : bool
+        False leaves traced shadows black.
+    training_texels : int
+        Texels, drawn at random, that shape the functions; all get coefficients.
+    """
+
+    n_components: int = 8
+    enabled: bool = True
+    training_texels: int = 4096
+
+    def __post_init__(self) -> None:
+        for name, least in (("n_components", 0), ("training_texels", 1)):
+            if getattr(self, name) < least:
+                raise InputError(
+                    f"{name}: expected at least {least}, received {getattr(self, name)}"
+                )
+
+
+@dataclass(frozen=True)
 class ComparisonOptions:
     """What the field is compared with, besides photographs.
 
@@ -153,6 +179,7 @@ class PipelineOptions:
     atlas: AtlasOptions = field(default_factory=lambda: AtlasOptions(resolution=0))
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     resampling: ResamplingOptions = field(default_factory=ResamplingOptions)
+    indirect: IndirectOptions = field(default_factory=IndirectOptions)
     completion: CompletionOptions = field(default_factory=CompletionOptions)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     compression: CompressionOptions = field(default_factory=CompressionOptions)

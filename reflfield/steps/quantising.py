@@ -68,6 +68,7 @@ class FieldMaker:
             mean=model.mean,
             basis=model.basis,
             domain=self.job.options.resampling.domain,  # type: ignore[arg-type]
+            indirect=self.job.indirect_light,
         )
 
     def build(self, model: ClusteredModel, frames: Floats, step: float) -> ReflectanceField:

@@ -1,8 +1,10 @@
 """Random fields for the tests of this room."""
 
+import numpy as np
 import pytest
 
 from reflfield.field.building import BaseSurface, FittedReflectance, build_field
+from reflfield.field.indirect import IndirectLight
 from reflfield.sphere.rotations import matrix_from_quaternion
 
 
@@ -22,6 +24,10 @@ def random_parts(rng, *, n_texels=60, n_clusters=3, n_components=4, view_side=4,
         coefficients=rng.normal(size=(n_texels, n_components)),
         mean=1.0 + rng.random((n_clusters, *nodes)),
         basis=0.2 * rng.normal(size=(n_clusters, n_components, *nodes)),
+        indirect=IndirectLight(
+            rng.normal(size=(3, 9, 3)).astype(np.float32),
+            rng.normal(size=(n_texels, 2)).astype(np.float32),
+        ),
     )
     return surface, reflectance
 

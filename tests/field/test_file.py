@@ -142,14 +142,14 @@ def test_any_flipped_byte_is_noticed_or_harmless(path, field, rng):
 
 
 def test_versions_of_the_past_are_refused(path):
-    edit_header(path, lambda header: header.update(version=1))
-    with pytest.raises(FieldFileError, match=r"version 1 of the format.*make the field again"):
+    edit_header(path, lambda header: header.update(version=2))
+    with pytest.raises(FieldFileError, match=r"version 2 of the format.*make the field again"):
         open_field(path)
 
 
 def test_newer_versions_are_refused(path):
     edit_header(path, lambda header: header.update(version=FORMAT_VERSION + 1))
-    with pytest.raises(FieldFileError, match=r"version 3 of the format.*install a newer"):
+    with pytest.raises(FieldFileError, match=r"version 4 of the format.*install a newer"):
         open_field(path)
 
 

@@ -203,3 +203,19 @@ class TestLuminance:
             found.samples[1, 0, 0], value[1, 0, [0, 2]].mean(), rtol=1e-6
         )
         np.testing.assert_array_equal(found.lights, np.tile([0.0, 0, 1], (4, 1, 1)))
+
+
+class TestShade:
+    def test_is_the_mean_over_views_of_what_lies_in_shadow(self, reader_of, rng):
+        samples = rng.random((12, 4, 5, 3))
+        views, lights = rng.random((12, 4)) < 0.7, rng.random((12, 5)) < 0.5
+        reader = reader_of(dome(4, 5), samples, domain="cube_root", views=views, lights=lights)
+        texels = np.array([1, 4, 11])
+        shade = reader.shade(texels)
+        stored = np.cbrt(samples.astype(np.float16).astype(float))
+        for k, t in enumerate(texels):
+            for j in range(5):
+                seen = views[t] if not lights[t, j] else np.zeros(4, bool)
+                assert shade.weights[k, j] == seen.sum()
+                expected = stored[t, seen, j].mean(axis=0) if seen.any() else np.zeros(3)
+                np.testing.assert_allclose(shade.values[k, j], expected, rtol=1e-6)

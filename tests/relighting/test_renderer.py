@@ -10,6 +10,7 @@ from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.field.building import FittedReflectance, build_field
 from reflfield.field.evaluation import evaluate, texel_taps
+from reflfield.field.indirect import IndirectLight
 from reflfield.field.synthetic import (
     FramedSurface,
     baked_field,
@@ -381,3 +382,33 @@ def test_window_holds_all_of_the_mesh():
     assert rows.max() < end_row
     assert first_column <= columns.min()
     assert columns.max() < end_column
+
+
+def test_shadows_show_indirect_light():
+    """A square lit from behind: no light reaches what the camera sees."""
+    surface = square_surface(4)
+    fit = FittedReflectance(
+        local_from_world=surface.base_from_world,
+        cluster=np.zeros(16, int),
+        coefficients=np.zeros((16, 0)),
+        mean=np.ones((1, 1, 1, 3)),
+        basis=np.zeros((1, 0, 1, 1, 3)),
+        # Y_00 = 1 / (2 sqrt(pi)): in the domain .5 for red, .2 for blue.
+        indirect=IndirectLight(
+            np.array([[[1.0, 0.0, 0.4]]], np.float32) * np.float32(np.sqrt(np.pi)),
+            np.zeros((16, 0), np.float32),
+        ),
+    )
+    traced, kept = (
+        build_field(surface, fit, visibility=visibility) for visibility in ("factored", "kept")
+    )
+    behind, camera = sun([0.0, 0.6, -0.8], [2.0, 2.0, 2.0]), overhead(size=9)
+    expected = np.broadcast_to([2 * 0.5**3, 0.0, 2 * 0.2**3], (9, 9, 3))
+    np.testing.assert_allclose(
+        render(traced, camera, behind, ONE_THREAD).image, expected, rtol=1e-5, atol=1e-9
+    )
+    # From the front everything is lit, and shadows that are in the data are not lit again.
+    front = sun([0.0, 0.6, 0.8])
+    pictures = [render(f, camera, front, ONE_THREAD).image for f in (traced, kept)]
+    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_allclose(pictures[0], 1.0, rtol=1e-4)

@@ -1,0 +1,101 @@
+"""Stage that finds what texels show where no light reaches them directly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from reflfield.field.indirect import fit_indirect
+from reflfield.observations.reading import Shade, TexelReader
+from reflfield.steps.job import Job
+
+# Within this many texel spacings of one that the light reaches, a pixel mixes both: about a
+# pixel and a half at the usual density. Such samples count little.
+EDGE_SPACINGS = 2.5
+EDGE_WEIGHT = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """What all blocks share whose shade is read.
+
+    Parameters
+    ----------
+    reader : TexelReader
+    at_edge : (n_texels, n_lights) bool
+        True where the light reaches the texel's surroundings.
+    """
+
+    reader: TexelReader
+    at_edge: NDArray[np.bool_]
+
+
+def shade_block(context: Shading, texels: NDArray[np.intp]) -> dict[str, Any]:
+    """Shade of some texels, one sample for each light."""
+    found = context.reader.shade(texels)
+    # Views agree but for noise, the model errs more: one sample, however many there are.
+    trust = np.where(context.at_edge[texels], EDGE_WEIGHT, 1.0)
+    weights = np.where(found.weights > 0, trust, 0.0)
+    return {
+        "values": found.values.astype(np.float16),
+        "weights": weights.astype(np.float32),
+        "lights": found.lights,
+        "samples": np.array(found.weights.sum(dtype=np.float64)),
+    }
+
+
+def write_indirect(job: Job, folder: Path) -> dict[str, Any]:
+    """Indirect light of all texels that a camera sees."""
+    options, reader, seen = job.options.indirect, job.base_reader, job.texels_in_view
+    at_edge = neighbourhood_reached(
+        job.texels.position, job.light_seen, EDGE_SPACINGS * job.texels.spacing
+    )
+    parts = job.blocks(folder).map(
+        "light in the shadows", shade_block, Shading(reader, at_edge), reader.blocks_of(seen)
+    )
+    shade = Shade(*(parts.joined(name) for name in ("values", "weights", "lights")))
+    n_samples = sum(float(part["samples"]) for part in parts)
+    in_shade = np.flatnonzero(shade.weights.any(axis=1))
+    rng = np.random.default_rng(job.options.seed)
+    n = min(len(in_shade), options.training_texels)
+    chosen = np.sort(rng.choice(in_shade, n, replace=False))
+
+    def read(texels: NDArray[np.intp]) -> Shade:
+        arrays = (shade.values[texels], shade.weights[texels], shade.lights[texels])
+        return replace(shade, **dict(zip(("values", "weights", "lights"), arrays, strict=True)))
+
+    model = fit_indirect(read, chosen, job.training.n_lights, options.n_components)
+    coefficients = np.zeros((reader.n_texels, len(model.variances)), np.float32)
+    for some in np.array_split(np.arange(len(seen)), max(1, len(seen) // 1024)):
+        coefficients[seen[some]] = model.coefficients(read(some))
+    np.savez(folder / "indirect.npz", functions=model.functions(), coefficients=coefficients)
+    return {
+        "samples in shadow": int(n_samples),
+        "texels that show shadow": len(in_shade),
+        "components": len(model.variances),
+        "residual in the domain": float(np.sqrt(model.noise)),
+    }
+
+
+def neighbourhood_reached(
+    positions: NDArray[np.floating], reached: NDArray[np.bool_], radius: float
+) -> NDArray[np.bool_]:
+    """(n, n_lights) bool: whether a light reaches any point within a radius.
+
+    Examples
+    --------
+    >>> line = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
+    >>> neighbourhood_reached(line, np.array([[True], [False], [False]]), 2.0).ravel()
+    array([ True,  True, False])
+    """
+    pairs = cKDTree(positions).query_pairs(radius, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    ones = np.ones(len(both), np.int32)
+    near = csr_array((ones, (both[:, 0], both[:, 1])), shape=(len(positions),) * 2)
+    return np.asarray(near @ reached.astype(np.int32) + reached > 0)

@@ -1,0 +1,208 @@
+"""Indirect light: planted functions come back from scattered shade, at any scale."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reflfield.errors import InputError, ShapeError
+from reflfield.field.building import FittedReflectance, Quantisation, build_field
+from reflfield.field.evaluation import sum_lights
+from reflfield.field.indirect import (
+    IndirectLight,
+    Systems,
+    band_limit_for,
+    fit_indirect,
+    no_indirect_light,
+)
+from reflfield.field.synthetic import square_surface
+from reflfield.observations.reading import Shade
+from reflfield.sphere.harmonics import real_harmonics
+
+N_LIGHTS, N_COMPONENTS = 30, 3
+
+
+def directions(rng, n):
+    found = rng.standard_normal((n, 3))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def planted(rng, n_texels=400, noise=0.01, share=0.4):
+    """Indirect light of a few functions, and the shade of texels under some lights each."""
+    functions = rng.standard_normal((N_COMPONENTS + 1, 9, 3)).astype(np.float32)
+    functions[0, 0] += 5.0
+    light = IndirectLight(
+        functions, rng.standard_normal((n_texels, N_COMPONENTS)).astype(np.float32)
+    )
+    lights = np.broadcast_to(directions(rng, N_LIGHTS), (n_texels, N_LIGHTS, 3))
+    values = domain_values(light, lights)
+    values = values + noise * rng.standard_normal(values.shape)
+    weights = (rng.random((n_texels, N_LIGHTS)) < share).astype(np.float32)
+    values = np.where(weights[..., None] > 0, values, 0)
+    return light, Shade(values.astype(np.float32), weights, lights.astype(np.float32))
+
+
+def domain_values(light, lights):
+    """Values in the domain, negative ones too, (n_texels, n_lights, 3)."""
+    harmonics = real_harmonics(lights[0], 3)
+    weights = np.concatenate(
+        [np.ones((len(light.coefficients), 1)), light.coefficients], axis=1
+    )
+    return np.einsum("lh,khc,nk->nlc", harmonics, light.functions, weights)
+
+
+def some(shade, texels):
+    return Shade(shade.values[texels], shade.weights[texels], shade.lights[texels])
+
+
+def fitted(shade, n_components=N_COMPONENTS, n_lights=N_LIGHTS):
+    model = fit_indirect(
+        lambda texels: some(shade, texels), np.arange(len(shade.values)), n_lights, n_components
+    )
+    return model, IndirectLight(model.functions(), model.coefficients(shade))
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.03])
+def test_planted_light_comes_back_where_nothing_was_seen(noise, rng):
+    truth, shade = planted(rng, noise=noise)
+    model, found = fitted(shade)
+    elsewhere = np.broadcast_to(directions(rng, 50), (400, 50, 3))
+    error = domain_values(found, elsewhere) - domain_values(truth, elsewhere)
+    # Twelve lights in shadow tell 3 coefficients from 36 numbers: the error is below the noise.
+    assert np.sqrt(np.mean(error**2)) < noise
+    assert np.sqrt(model.noise) == pytest.approx(noise, rel=0.15)
+
+
+def test_more_noise_is_more_error_in_proportion(rng):
+    errors = []
+    for noise in (0.001, 0.01, 0.1):
+        truth, shade = planted(np.random.default_rng(7), noise=noise)
+        found = fitted(shade)[1]
+        elsewhere = np.broadcast_to(directions(np.random.default_rng(8), 50), (400, 50, 3))
+        error = domain_values(found, elsewhere) - domain_values(truth, elsewhere)
+        errors.append(np.sqrt(np.mean(error**2)))
+    slope = np.diff(np.log(errors)) / np.log(10)
+    assert np.all((slope > 0.8) & (slope < 1.1)), errors
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("scale", [1e-12, 1e-4, 1e6])
+def test_scale_does_not_matter(scale, rng):
+    _, shade = planted(rng)
+    usual = fitted(shade)[1]
+    scaled = fitted(Shade(shade.values * np.float32(scale), shade.weights, shade.lights))[1]
+    lights = np.broadcast_to(directions(rng, 20), (400, 20, 3))
+    expected = domain_values(usual, lights)
+    size = np.abs(expected).max()
+    assert np.abs(domain_values(scaled, lights) / scale - expected).max() < 1e-4 * size
+
+
+@pytest.mark.stability
+def test_no_shade_no_energy_and_one_texel_are_defined(rng):
+    _, shade = planted(rng, n_texels=5)
+    unseen = Shade(shade.values, 0 * shade.weights, shade.lights)
+    black = Shade(0 * shade.values, shade.weights, shade.lights)
+    for nothing in (unseen, black):
+        model, found = fitted(nothing)
+        assert len(model.variances) == 0
+        assert found.is_black
+        assert found.coefficients.shape == (5, 0)
+    one = some(shade, np.zeros(1, int))
+    model, found = fitted(one)
+    assert np.isfinite(found.functions).all()
+    assert np.isfinite(found.coefficients).all()
+    seen = one.weights[0] > 0
+    residual = (domain_values(found, one.lights) - one.values)[0, seen]
+    assert np.abs(residual).max() < 0.2 * np.abs(one.values).max()
+
+
+@pytest.mark.stability
+def test_duplicates_share_one_answer(rng):
+    _, shade = planted(rng, n_texels=50)
+    twice = some(shade, np.concatenate([np.arange(50), np.arange(50)]))
+    found = fitted(twice)[1]
+    np.testing.assert_allclose(found.coefficients[:50], found.coefficients[50:], atol=1e-5)
+
+
+def test_texel_in_no_shadow_takes_the_mean(rng):
+    _, shade = planted(rng)
+    shade.weights[3] = 0
+    found = fitted(shade)[1]
+    assert np.all(found.coefficients[3] == 0)
+
+
+def test_normal_equations_are_the_sums_they_say(rng):
+    _, shade = planted(rng, n_texels=3)
+    system = Systems.of(shade, 3)
+    for t in range(3):
+        design = np.kron(real_harmonics(shade.lights[t], 3), np.eye(3))
+        weight = np.repeat(shade.weights[t], 3).astype(float)
+        values = shade.values[t].astype(float).ravel()
+        np.testing.assert_allclose(
+            system.gram[t], design.T @ (weight[:, None] * design), atol=1e-6
+        )
+        np.testing.assert_allclose(system.moments[t], design.T @ (weight * values), atol=1e-4)
+        assert system.energy[t] == pytest.approx(np.sum(weight * values**2))
+        assert system.count[t] == 3 * np.count_nonzero(shade.weights[t])
+
+
+def test_few_lights_get_few_harmonics():
+    assert [band_limit_for(n) for n in (1, 2, 7, 8, 18, 32, 10_000)] == [1, 1, 1, 2, 3, 4, 4]
+
+
+def test_both_evaluations_agree(rng):
+    light, _ = planted(rng, n_texels=20)
+    lights, texels = directions(rng, 7), rng.integers(0, 20, 9)
+    under = light.under(texels, lights, 3)
+    towards = light.towards(np.repeat(texels, 7), np.tile(lights, (9, 1)), 3)
+    np.testing.assert_allclose(under.reshape(-1, 3), towards, rtol=2e-4, atol=1e-4)
+    assert under.min() >= 0
+    assert light.towards(np.zeros(0, int), np.zeros((0, 3)), 3).shape == (0, 3)
+    assert light.under(np.zeros(0, int), lights, 3).shape == (0, 7, 3)
+
+
+def test_field_keeps_it_within_half_a_step(parts):
+    surface, fit = parts
+    kept = build_field(surface, fit, quantisation=Quantisation(0.05)).indirect
+    np.testing.assert_array_equal(kept.functions, fit.indirect.functions)
+    off = np.abs(kept.coefficients - fit.indirect.coefficients)
+    # Half a step of .05, and rounding to single precision.
+    assert 0.02 < off.max() < 0.025001
+
+
+def test_lights_that_do_not_reach_bring_indirect_light(make_field, rng):
+    field = make_field()
+    black = {**field.arrays, "indirect_functions": 0 * field.arrays["indirect_functions"]}
+    texels, lights, powers = np.array([0, 5, -1]), directions(rng, 4), rng.random((4, 3))
+    views = np.tile([0.0, 0.0, 1.0], (3, 1))
+    lit = np.array([[1, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]], bool)
+    with_it, without = (
+        sum_lights(f, texels, views, lights, powers, lit)
+        for f in (field, replace(field, arrays=black))
+    )
+    indirect = field.indirect.under(texels[:2], lights, 3)
+    expected = np.einsum("nmc,mc,nm->nc", indirect, powers, ~lit[:2])
+    np.testing.assert_allclose((with_it - without)[:2], expected, rtol=1e-4, atol=1e-5)
+    assert np.all(with_it[2] == 0)
+    everywhere = sum_lights(field, texels, views, lights, powers)
+    np.testing.assert_array_equal(
+        everywhere, sum_lights(field, texels, views, lights, powers, lit | True)
+    )
+
+
+def test_bad_light_is_refused(rng):
+    with pytest.raises(InputError, match="n_components: expected >= 0"):
+        fitted(planted(rng, n_texels=2)[1], n_components=-1)
+    with pytest.raises(ShapeError, match="coefficients"):
+        IndirectLight(np.zeros((3, 9, 3), np.float32), np.zeros((5, 3), np.float32))
+    surface = square_surface(2)
+    fit = FittedReflectance(
+        local_from_world=np.tile(np.eye(3), (4, 1, 1)),
+        cluster=np.zeros(4, int),
+        coefficients=np.zeros((4, 0)),
+        mean=np.ones((1, 1, 1, 3)),
+        basis=np.zeros((1, 0, 1, 1, 3)),
+        indirect=no_indirect_light(3),
+    )
+    with pytest.raises(ShapeError, match="indirect"):
+        build_field(surface, fit)
