@@ -62,6 +62,9 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
     shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
     unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
     used = counts["compression"]["samples fitted"]
+    shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
+    mixed = shade["samples at edges of shadows"]
+    shown = shade["samples in shadow"] - mixed
     return Account(
         "compression",
         "samples",
@@ -69,7 +72,9 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
         {
             "fitted": used,
             "texel not seen by the camera": int(unseen),
-            "texel in shadow of the surface": int(shadowed),
+            "in shadow: fitted as indirect light": shown,
+            "in shadow: at its edge": mixed,
+            "in shadow: nothing made of them": int(shadowed) - shown - mixed,
             "below the horizon of the texel's frame, or outside the light's cone": counts[
                 "completion"
             ]["samples observed"]

@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from reflfield.field.indirect import fit_indirect
 from reflfield.observations.reading import Shade, TexelReader
 from reflfield.steps.job import Job
+from reflfield.steps.surface import pixel_width
 
-# Within this many texel spacings of one that the light reaches, a pixel mixes both: about a
-# pixel and a half at the usual density. Such samples count little.
-EDGE_SPACINGS = 2.5
-EDGE_WEIGHT = 0.1
+# Texels so near to one that the light reaches, in texel spacings and not less than a pixel, are
+# at the edge of a shadow: their pixels mix both.
+EDGE_SPACINGS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,27 +40,28 @@ def shade_block(context: Shading, texels: NDArray[np.intp]) -> dict[str, Any]:
     """Shade of some texels, one sample for each light."""
     found = context.reader.shade(texels)
     # Views agree but for noise, the model errs more: one sample, however many there are.
-    trust = np.where(context.at_edge[texels], EDGE_WEIGHT, 1.0)
-    weights = np.where(found.weights > 0, trust, 0.0)
+    used = (found.weights > 0) & ~context.at_edge[texels]
     return {
         "values": found.values.astype(np.float16),
-        "weights": weights.astype(np.float32),
+        "weights": used.astype(np.float32),
         "lights": found.lights,
         "samples": np.array(found.weights.sum(dtype=np.float64)),
+        "used": np.array((found.weights * used).sum(dtype=np.float64)),
     }
 
 
 def write_indirect(job: Job, folder: Path) -> dict[str, Any]:
     """Indirect light of all texels that a camera sees."""
     options, reader, seen = job.options.indirect, job.base_reader, job.texels_in_view
-    at_edge = neighbourhood_reached(
-        job.texels.position, job.light_seen, EDGE_SPACINGS * job.texels.spacing
-    )
+    radius = max(EDGE_SPACINGS * job.texels.spacing, pixel_width(job.training, job.hull_mesh))
+    at_edge = neighbourhood_reached(job.texels.position, job.light_seen, radius)
     parts = job.blocks(folder).map(
         "light in the shadows", shade_block, Shading(reader, at_edge), reader.blocks_of(seen)
     )
     shade = Shade(*(parts.joined(name) for name in ("values", "weights", "lights")))
-    n_samples = sum(float(part["samples"]) for part in parts)
+    n_samples, n_used = (
+        sum(float(part[name]) for part in parts) for name in ("samples", "used")
+    )
     in_shade = np.flatnonzero(shade.weights.any(axis=1))
     rng = np.random.default_rng(job.options.seed)
     n = min(len(in_shade), options.training_texels)
@@ -77,6 +78,7 @@ def write_indirect(job: Job, folder: Path) -> dict[str, Any]:
     np.savez(folder / "indirect.npz", functions=model.functions(), coefficients=coefficients)
     return {
         "samples in shadow": int(n_samples),
+        "samples at edges of shadows": int(n_samples - n_used),
         "texels that show shadow": len(in_shade),
         "components": len(model.variances),
         "residual in the domain": float(np.sqrt(model.noise)),

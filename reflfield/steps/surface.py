@@ -111,19 +111,24 @@ def write_atlas_arrays(path: Path, atlas: Atlas) -> None:
     )
 
 
+def pixel_width(capture: Capture, mesh: Mesh) -> float:
+    """Width of a pixel on the object, metres; the median of the cameras."""
+    centre = mesh.bounds.mean(axis=0)[None]
+    footprints = []
+    for camera in capture.cameras:
+        _, depth = camera.project(centre)
+        scale = 1.0 if camera.kind == "orthographic" else float(depth[0])
+        footprints.append(scale / max(camera.fl_x, camera.fl_y))
+    return float(np.median(footprints))
+
+
 # Share of a texture that charts usually cover.
 TYPICAL_USE = 0.6
 
 
 def derived_resolution(job: Job, mesh: Mesh) -> int:
-    """Side of a texture whose texels are a little finer than the nearest camera's pixels."""
-    centre = mesh.bounds.mean(axis=0)[None]
-    footprints = []
-    for camera in job.training.cameras:
-        _, depth = camera.project(centre)
-        scale = 1.0 if camera.kind == "orthographic" else float(depth[0])
-        footprints.append(scale / max(camera.fl_x, camera.fl_y))
-    texel = float(np.median(footprints)) / job.options.texture.texels_per_pixel
+    """Side of a texture whose texels are a little finer than the cameras' pixels."""
+    texel = pixel_width(job.training, mesh) / job.options.texture.texels_per_pixel
     if not texel > 0:
         raise GeometryError("cameras: expected the object in front of most, found it behind")
     side = np.sqrt(mesh.area / TYPICAL_USE) / texel

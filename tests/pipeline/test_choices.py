@@ -159,8 +159,9 @@ class TestWhatATrialLeaves:
         # The report's own time is known when it is done.
         timings = json.loads((tried / "timings.json").read_text())
         assert timings["seconds"] == pytest.approx(sum(found.values()), rel=1e-9)
-        # Before what is open, for each visibility, for each fit in it, the report.
-        assert len(found) == 5 + 2 * 3 + 4 * 2 + 1
+        # Before what is open, for each visibility (and what its shadows show, if they are
+        # traced), for each fit in it, the report.
+        assert len(found) == 5 + 2 * 3 + 1 + 4 * 2 + 1
 
     def test_options_are_as_asked_with_what_was_taken_above(self, tried):
         text = (tried / "options.toml").read_text()
@@ -407,6 +408,7 @@ def test_shadows_are_treated_as_the_object_needs(better, run_open, tmp_path):
         hold_out=HoldOut(views=1, lights=n_lights),
         last="compression",
     )
+    print(job.stages.record("choices").counts["heldout PSNR, dB"])
     assert job.options.resampling.visibility == better
     assert open_field(tmp_path / "out" / "field.rfld").visibility == better
     psnr = job.stages.record("choices").counts["heldout PSNR, dB"]
