@@ -517,7 +517,7 @@ class TestOptions:
             ({"domain": "log"}, "domain: expected one of"),
             ({"smoothness": 0.0}, "smoothness: expected > 0, received 0.0"),
             ({"smoothness": float("nan")}, "smoothness: expected > 0"),
-            ({"visibility": "traced"}, "visibility: expected 'factored' or 'kept'"),
+            ({"visibility": "traced"}, "visibility: expected 'factored', 'kept'"),
         ],
     )
     def test_are_checked(self, changes, message):
