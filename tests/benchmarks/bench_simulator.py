@@ -173,9 +173,7 @@ def off_is_free(n_runs):
 def write_whole(scene, workers, max_memory):
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
         start, spent = time.perf_counter(), time.process_time()
-        write_capture(
-            scene, Path(folder) / "capture", workers=workers, max_memory=max_memory
-        )
+        write_capture(scene, Path(folder) / "capture", workers=workers, max_memory=max_memory)
         wall, spent = time.perf_counter() - start, time.process_time() - spent
         files = [f for f in Path(folder).rglob("*") if f.is_file()]
         size = sum(file.stat().st_size for file in files)
