@@ -150,6 +150,13 @@ def test_few_lights_get_few_harmonics():
     assert [band_limit_for(n) for n in (1, 2, 7, 8, 18, 32, 10_000)] == [1, 1, 1, 2, 3, 4, 4]
 
 
+def test_basis_functions_are_of_unit_size(rng):
+    functions = fitted(planted(rng)[1])[1].functions.astype(float)
+    # By Parseval, the mean square over the sphere is that of the coefficients over 4 pi.
+    squares = np.sum(functions[1:] ** 2, axis=(1, 2)) / (4 * np.pi * 3)
+    np.testing.assert_allclose(squares, 1.0, rtol=1e-5)
+
+
 def test_both_evaluations_agree(rng):
     light, _ = planted(rng, n_texels=20)
     lights, texels = directions(rng, 7), rng.integers(0, 20, 9)

@@ -150,6 +150,15 @@ def test_a_single_view_does_not_bound_the_object():
         ball_hull(n=1)
 
 
+def test_object_that_leaves_the_images_is_refused():
+    views = rigs.cameras(6, size=128)
+    silhouettes = [rigs.ball_silhouette(view, radius=1.5) for view in views]
+    for silhouette in silhouettes:
+        silhouette[:4] = 0.0
+    with pytest.raises(GeometryError, match="borders of their images cut off"):
+        visual_hull(views, silhouettes, HullOptions(resolution=64))
+
+
 def test_sizes_and_counts_are_checked():
     views = rigs.cameras(4)
     good = [rigs.ball_silhouette(view) for view in views]
