@@ -25,11 +25,14 @@ from reflfield.steps.options import (
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
 # The demo has to end within three minutes on two cores, compilation included: texels a little
-# coarser than usual, frames of the harmonic search, and a second field for the comparison.
+# coarser than usual, frames of the harmonic search, the fit that trials would take, and a
+# second field for the comparison.
 OPTIONS = PipelineOptions(
     texture=TextureOptions(texels_per_pixel=1.1),
     alignment=AlignmentOptions(refine=False),
-    compression=CompressionOptions(samples=SampleFitOptions(frame_spread_deg=0.0)),
+    compression=CompressionOptions(
+        fit="samples", samples=SampleFitOptions(frame_spread_deg=0.0)
+    ),
     comparison=ComparisonOptions(without_alignment=True),
 )
 
