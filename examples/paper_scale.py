@@ -173,6 +173,7 @@ def kill_and_resume(arguments: argparse.Namespace, capture: Path) -> None:
         running = subprocess.Popen(command, stdout=sys.stderr)
         try:
             running.wait(rng.uniform(0.2, 1.8) * lasting / (arguments.kill + 1))
+            print(f"kill {kill + 1}: too late, the job was done", flush=True)
         except subprocess.TimeoutExpired:
             running.kill()
             running.wait()
