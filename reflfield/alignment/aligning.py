@@ -6,9 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from reflfield.alignment.expectation import TargetFit, fit_targets, mean_targets
-from reflfield.alignment.gauge import Gauged, fix_gauge, fold, turn_targets, turns_are_open
+from reflfield.alignment.gauge import (
+    Gauged,
+    fix_gauge,
+    fold,
+    mean_rotation,
+    turn_targets,
+    turns_are_open,
+)
 from reflfield.alignment.horizon import Horizon, extend_targets, settle
 from reflfield.alignment.materials import (
     Materials,
@@ -20,6 +28,7 @@ from reflfield.alignment.materials import (
 from reflfield.alignment.refinement import (
     RefinementOptions,
     SampleSet,
+    improve_frames,
     refine_targets,
 )
 from reflfield.alignment.samples import (
@@ -44,6 +53,7 @@ from reflfield.scheduling import one_core_blas
 from reflfield.sphere.coupling import Coupled, couple, join_coupled
 from reflfield.sphere.harmonics import check_band_limit
 from reflfield.sphere.projection import Projector
+from reflfield.sphere.rotations import rotation_angle
 
 # Texels whose coefficients are kept for the iterations: enough that their mean
 # has converged far below the error of one frame.
@@ -56,6 +66,9 @@ PROJECTION_BLOCK = 128
 EXTENSIONS = 3
 # Turns about the normal and normals of a texel are improved in turn so often.
 TURN_PASSES = 3
+# The axis of symmetry on the samples lies this near to that of the band-limited target, or the
+# refinement has gone astray.
+LARGEST_AXIS_CORRECTION = np.deg2rad(2.0)
 # Samples kept for the targets of the refinement.
 REFINING_BYTES = 256 * 2**20
 
@@ -365,7 +378,49 @@ def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit, aims: _Aims) -> _
     weights = np.where(data.brightness() > 0, np.maximum(score, 0.0), 0.0)
     means = mean_targets(view.training, weights, better, n_clusters)
     regauged = fix_gauge(means, rotations, state.cluster, weights, turned.tolist())
+    turns = regauged.turns.copy()
+    for k in np.flatnonzero([symmetry.kind != "none" for symmetry in regauged.symmetries]):
+        mine = np.flatnonzero((state.cluster == k) & (weights > 0))
+        own = (data.part(mine), state.part(mine), weights[mine])
+        turns[k] = _about_symmetry_axis(turns[k], *own, options, task.n_threads)
+    regauged = replace(
+        regauged,
+        targets=turn_targets(means, turns),
+        rotations=_fold_all(rotations @ turns[state.cluster], state.cluster, regauged),
+        turns=turns,
+    )
     return _Sharp(state.targets, options, regauged, turned)
+
+
+def _about_symmetry_axis(
+    turn: NDArray[np.float64],
+    data: SampleSet,
+    state: Materials,
+    weights: NDArray[np.float64],
+    options: RefinementOptions,
+    n_threads: int,
+) -> NDArray[np.float64]:
+    """Turn of a gauge whose normal is the axis of half-turn symmetry on the samples.
+
+    Frames half turned about the normal are refined again; what they have turned by in the
+    mean is the half turn that leaves the sharp target unchanged. Band-limited targets, cut at
+    the horizon, know its axis to some hundredths of a degree.
+    """
+    half_turn = turn @ np.diag([-1.0, -1.0, 1.0]) @ turn.T
+    frames, brightness = half_turn @ state.frames, state.brightness.copy()
+    improve_frames(
+        *(data, frames, brightness, state.cluster, state.targets, options),
+        *(options.steps, n_threads),
+    )
+    turned_by = frames @ np.swapaxes(state.frames, 1, 2)
+    near = rotation_angle(half_turn.T @ turned_by) < LARGEST_AXIS_CORRECTION
+    if not near.any():
+        return turn
+    found = mean_rotation(turned_by[near], weights[near])
+    axis = np.linalg.eigh(found + found.T)[1][:, 2]
+    axis *= np.sign(axis @ turn[:, 2]) or 1.0
+    across = np.cross(turn[:, 2], axis)
+    return Rotation.from_rotvec(across).as_matrix() @ turn
 
 
 def _turn_cluster(

@@ -3,6 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import RefinementOptions, align
+from reflfield.alignment.gauge import mean_rotation
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.rotations import frames_from_normals
 
@@ -42,6 +43,15 @@ def test_normals_come_back_and_refinement_makes_them_sharp(relief, aligned, scen
     # The mean tangent is a gauge: the base frames', not the truth's.
     assert tangent.mean() < 5.0
     assert aligned.symmetries == ("half",)
+
+
+def test_refined_frames_share_no_turn(relief, aligned):
+    """The axis of symmetry that is their normal is found on the samples."""
+    common = mean_rotation(
+        aligned.local_from_base @ np.swapaxes(relief[0], 1, 2), np.ones(len(relief[0]))
+    )
+    # .05 degrees with the axis of the band-limited target, .001 so.
+    assert np.degrees(np.linalg.norm(common[:2, 2])) < 0.01
 
 
 def test_options_of_the_refinement_are_used_as_given(relief, scene):
