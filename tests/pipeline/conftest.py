@@ -13,6 +13,10 @@ from capture_sim.scene import parse_scene
 from capture_sim.write import write_capture
 from reflfield.cli import main
 
+# Cuts all blocks small when it is imported, which is for processes of its own only: looked
+# into for doctests, it would do so to every test.
+collect_ignore = ["counted.py"]
+
 # A satin ball seen by 10 cameras of 32 x 32 pixels under 6 lights: a run takes seconds.
 SCENE = {
     "name": "tiny",
