@@ -29,8 +29,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import distributed
 
@@ -161,30 +162,73 @@ def digests(out: Path) -> dict[str, str]:
     return found
 
 
+class Moment(NamedTuple):
+    """When a process is killed: in a stage with so many blocks kept, some seconds later."""
+
+    stage: str
+    n_kept: int
+    wait: float
+
+
+def moments(stages: list[dict[str, Any]], n: int, rng: random.Random) -> list[Moment]:
+    """Random moments, in order, each stage as probable as it is long.
+
+    They are told by what is finished, not by the clock, so that none comes too late.
+    """
+    stages = [stage for stage in stages if stage["name"] not in ("comparison", "report")]
+    drawn = rng.choices(range(len(stages)), [stage["seconds"] for stage in stages], k=n)
+    found = []
+    for i, share in sorted((i, rng.random()) for i in drawn):
+        blocks = stages[i]["blocks_computed"]
+        seconds = stages[i]["seconds"]
+        wait = rng.random() * seconds / (blocks + 1) if blocks else 0.9 * share * seconds
+        found.append(Moment(stages[i]["name"], int(share * blocks), wait))
+    return found
+
+
+def kept_blocks(out: Path, stage: str) -> dict[str, int]:
+    """Blocks that an unfinished stage has kept, and when each was written."""
+    folder = out / "stages" / f"{stage}.partial" / "blocks"
+    return {str(path): path.stat().st_mtime_ns for path in folder.glob("*/*.block")}
+
+
+def kill_at(running: subprocess.Popen[bytes], out: Path, moment: Moment) -> None:
+    """Wait for the moment, and kill the process."""
+    stage = out / "stages" / f"{moment.stage}.partial"
+    while not stage.is_dir() or len(kept_blocks(out, moment.stage)) < moment.n_kept:
+        if running.poll() is not None or (stage.with_suffix("") / "stage.json").is_file():
+            break
+        time.sleep(0.01)
+    with suppress(subprocess.TimeoutExpired):
+        running.wait(moment.wait)
+    running.kill()
+    if running.wait() != -signal.SIGKILL:
+        sys.exit(f"{moment}: the process had ended by itself, {running.returncode}")
+
+
 def kill_and_resume(arguments: argparse.Namespace, capture: Path) -> None:
     """Process again, killed at random moments, and compare with the run that was not."""
     whole, out = arguments.out / "run", arguments.out / "killed"
     shutil.rmtree(out, ignore_errors=True)
-    lasting = json.loads((whole / "timings.json").read_text())["seconds"]
-    rng = random.Random(arguments.seed)
+    stages = json.loads((whole / "timings.json").read_text())["stages"]
     words = process_words(arguments, capture, out, arguments.texels, 2048)
     command = list(map(str, words))
-    for kill in range(arguments.kill):
-        running = subprocess.Popen(command, stdout=sys.stderr)
-        try:
-            running.wait(rng.uniform(0.2, 1.8) * lasting / (arguments.kill + 1))
-            print(f"kill {kill + 1}: too late, the job was done", flush=True)
-        except subprocess.TimeoutExpired:
-            running.kill()
-            running.wait()
-            at = [path.stem for path in out.glob("stages/*.partial")]
-            print(f"kill {kill + 1}: in {', '.join(at) or 'no stage'}", flush=True)
+    kept: dict[str, dict[str, int]] = {}
+    for moment in moments(stages, arguments.kill, random.Random(arguments.seed)):
+        kill_at(subprocess.Popen(command, stdout=sys.stderr), out, moment)
+        at = [path.stem for path in out.glob("stages/*.partial")]
+        for stage in at:
+            before, kept[stage] = kept.get(stage, {}), kept_blocks(out, stage)
+            if before.items() - kept[stage].items():
+                sys.exit(f"{stage}: blocks that an earlier kill had left were computed again")
+        counts = ", ".join(f"{stage} with {len(kept[stage])} blocks kept" for stage in at)
+        print(f"killed in {counts or 'no stage'}", flush=True)
     subprocess.run(command, check=True, stdout=sys.stderr)
     for record in json.loads((out / "timings.json").read_text())["stages"]:
-        if record["blocks_resumed"]:
+        if (stage := record["name"]) in kept:
             print(
-                f"{record['name']}: {record['blocks_resumed']} blocks taken up, "
-                f"{record['blocks_computed']} computed after the last kill"
+                f"{stage}: of {len(kept[stage])} blocks kept at its last kill "
+                f"{record['blocks_resumed']} taken up, {record['blocks_computed']} computed"
             )
     compare(whole, out)
 
