@@ -23,9 +23,13 @@ SHORTEST_STEP = 1e-4
 FIRST_TRUST_RADIUS = 0.25
 # Peaks that rise less than this share of the highest above the mean are given up.
 HOPEFUL = 0.8
-# The second-order expansion foretells the height of a peak this near.
-RELIABLE_STEP = 0.1
+# The second-order expansion foretells the height of a peak this near, but for the rise times
+# so many times the distance.
+RELIABLE_STEP = 0.25
+ALLOWANCE = 3.0
 EQUAL_SHARE = 1e-3
+# Cosine of an angle within which two candidates begin at the same rotation.
+SAME_START = np.cos(1e-3)
 
 
 DegreeArrays = tuple[
@@ -40,6 +44,13 @@ def copy_matrix(source: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     for i in range(3):
         for k in range(3):
             out[i, k] = source[i, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def half_turn_about_z(rotation: NDArray[np.float64]) -> None:
+    """Turn a rotation of the target by half a turn about z, in place."""
+    for i in range(3):
+        rotation[i, 0], rotation[i, 1] = -rotation[i, 0], -rotation[i, 1]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -175,9 +186,11 @@ def ascend(
             break
         # A short step foretells the peak only where the function is concave: from a saddle,
         # where the approach with few degrees often ends, most of the rise is still to come.
-        if length < RELIABLE_STEP and max(_predicted(found, step), value + rise) < hoped:
-            found[0] = _predicted(found, step)
-            break
+        if length < RELIABLE_STEP:
+            gain = _predicted(found, step) - value
+            if value + max(gain * (1.0 + ALLOWANCE * length), rise) < hoped:
+                found[0] = value + gain
+                break
     found[10] = length
 
 
@@ -230,16 +243,46 @@ def _next_hopeful(
 
 @numba.njit(cache=True, nogil=True)
 def _already_there(
-    rotations: NDArray[np.float64], done: NDArray[np.bool_], values: NDArray[np.float64], c: int
+    rotations: NDArray[np.float64],
+    done: NDArray[np.bool_],
+    values: NDArray[np.float64],
+    c: int,
+    symmetric: bool,
 ) -> bool:
-    """Whether a climbed candidate ended where this one heads; takes over its value then."""
+    """Whether a climbed candidate ended where this one heads; takes over its value then.
+
+    A symmetric series is the same where a candidate is half turned about z.
+    """
     near = np.cos(0.5 * PEAK_DISTANCE)
     for other in range(len(values)):
-        if done[other] and _cosine_between(rotations[c], rotations[other], False) > near:
-            copy_matrix(rotations[other], rotations[c])
+        if done[other] and _cosine_between(rotations[c], rotations[other], symmetric) > near:
+            _copy_nearest(rotations[other], symmetric, rotations[c])
             values[c] = values[other]
             return True
     return False
+
+
+@numba.njit(cache=True, nogil=True)
+def _copy_nearest(
+    source: NDArray[np.float64], half_turn: bool, out: NDArray[np.float64]
+) -> None:
+    """A rotation, or it half turned about z if that is nearer, into `out`."""
+    x, y = 0.0, 0.0
+    for i in range(3):
+        x += source[i, 0] * out[i, 0]
+        y += source[i, 1] * out[i, 1]
+    copy_matrix(source, out)
+    if half_turn and x + y < 0.0:
+        half_turn_about_z(out)
+
+
+@numba.njit(cache=True, nogil=True)
+def _partner(starts: NDArray[np.float64], c: int) -> int:
+    """Earlier candidate that begins where this one does, but for a half turn about z; or -1."""
+    for other in range(c):
+        if _cosine_between(starts[c], starts[other], True) > SAME_START:
+            return other
+    return -1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -257,6 +300,101 @@ def _highest_elsewhere(
     return highest
 
 
+# What `ascend` climbs on: the complex series, tables of its degrees, scratch.
+Climbed = tuple[
+    NDArray[np.floating],
+    NDArray[np.floating],
+    DegreeArrays,
+    tuple[NDArray[np.floating], NDArray[np.floating]],
+]
+
+
+@numba.njit(cache=True, nogil=True)
+def _approach(
+    on: Climbed,
+    mean: float,
+    lowest_z: float,
+    symmetric: bool,
+    mine: NDArray[np.float64],
+    values: NDArray[np.float64],
+) -> float:
+    """Move the candidates towards their peaks; the value of the highest."""
+    re, im, tables, scratch = on
+    starts = mine.copy() if symmetric else mine
+    at, top = np.zeros(11), -np.inf
+    for c in range(len(mine)):
+        partner = _partner(starts, c) if symmetric else -1
+        if partner >= 0:
+            _copy_nearest(mine[partner], True, mine[c])
+            values[c] = values[partner]
+            continue
+        hoped = mean + HOPEFUL * (top - mean)
+        limits = (APPROACH_STEPS, APPROACHED_STEP, lowest_z, hoped)
+        ascend(mine[c], re, im, tables, scratch, limits, at)
+        values[c] = at[0]
+        top = max(top, at[0])
+    return top
+
+
+@numba.njit(cache=True, nogil=True)
+def _climb_hopeful(
+    on: Climbed,
+    levels: tuple[float, float],
+    lowest_z: float,
+    symmetric: bool,
+    mine: NDArray[np.float64],
+    values: NDArray[np.float64],
+    best: NDArray[np.float64],
+    found: NDArray[np.float64],
+) -> None:
+    """Climb candidates, from the most promising on, while they may still be the best.
+
+    `levels`: the mean of the series, and the highest value so far.
+    """
+    re, im, tables, scratch = on
+    mean, top = levels
+    hopes, done, at = values.copy(), np.zeros(len(mine), np.bool_), np.zeros(11)
+    found[0] = -np.inf
+    while True:
+        c = _next_hopeful(hopes, done, mean, top)
+        if c < 0:
+            break
+        if not _already_there(mine, done, values, c, symmetric):
+            # A peak that is equal but for rounding, as symmetry makes them, is no better.
+            hoped = found[0] + EQUAL_SHARE * (found[0] - mean)
+            limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, hoped)
+            ascend(mine[c], re, im, tables, scratch, limits, at)
+            values[c] = at[0]
+            if at[0] > hoped:
+                found[:] = at
+                copy_matrix(mine[c], best)
+        done[c] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_at_other_side(
+    on: Climbed,
+    lowest_z: float,
+    mine: NDArray[np.float64],
+    values: NDArray[np.float64],
+    best: NDArray[np.float64],
+    found: NDArray[np.float64],
+) -> None:
+    """Climb from the best half turned about z; what little the sides differ by decides."""
+    re, im, tables, scratch = on
+    at, other = np.zeros(11), best.copy()
+    half_turn_about_z(other)
+    begun = other.copy()
+    limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, found[0])
+    ascend(other, re, im, tables, scratch, limits, at)
+    for c in range(len(mine)):
+        if _cosine_between(mine[c], begun, False) > np.cos(0.5 * PEAK_DISTANCE):
+            values[c] = at[0]
+    if at[0] > found[0]:
+        found[:] = at
+        copy_matrix(other, best)
+
+
 @numba.njit(cache=True, nogil=True)
 def climb_best(
     series: NDArray[np.floating],
@@ -264,7 +402,7 @@ def climb_best(
     first: NDArray[np.int64],
     rotations: NDArray[np.float64],
     lowest_z: float,
-    half_turn: bool,
+    half_turns: tuple[bool, bool],
     low: DegreeArrays,
     full: DegreeArrays,
     best: NDArray[np.float64],
@@ -277,41 +415,28 @@ def climb_best(
     approached with the low degrees; then, from the most promising on, climbed with
     all degrees while they may still be the best. `best` (k, 3, 3) receives the rotations,
     `found` (k, 11) their derivatives, and `rival` (k,) the highest value that ended elsewhere.
+
+    `half_turns`: whether rotations that differ by a half turn about z count as one in
+    `rival`; and whether the series hardly change with it: of two such candidates only one is
+    climbed, and both sides of the best are looked at in the end.
     """
+    half_turn, symmetric = half_turns
     like, n_entries, n_low = series.dtype, full[0][-1], low[0][-1]
     re, im = np.zeros(n_entries, like), np.zeros(n_entries, like)
     re_low, im_low = np.zeros(n_low, like), np.zeros(n_low, like)
     scratch = (np.zeros(n_entries, like), np.zeros((2, full[2].size), like))
     scratch_low = (np.zeros(n_low, like), np.zeros((2, low[2].size), like))
-    at = np.zeros(11)
+    on, on_low = (re, im, full, scratch), (re_low, im_low, low, scratch_low)
     for i in range(rows.shape[0]):
         mine = rotations[first[i] : first[i + 1]]
-        values, done = np.zeros(len(mine)), np.zeros(len(mine), np.bool_)
+        values, mean = np.zeros(len(mine)), float(series[rows[i], 0])
         complex_spectrum(series[rows[i]], low[0], re_low, im_low)
-        mean, top = float(series[rows[i], 0]), -np.inf
-        for c in range(len(mine)):
-            hoped = mean + HOPEFUL * (top - mean)
-            limits = (APPROACH_STEPS, APPROACHED_STEP, lowest_z, hoped)
-            ascend(mine[c], re_low, im_low, low, scratch_low, limits, at)
-            values[c] = at[0]
-            top = max(top, at[0])
+        top = _approach(on_low, mean, lowest_z, symmetric, mine, values)
         complex_spectrum(series[rows[i]], full[0], re, im)
-        hopes = values.copy()
-        found[i, 0] = -np.inf
-        while True:
-            c = _next_hopeful(hopes, done, mean, top)
-            if c < 0:
-                break
-            if not _already_there(mine, done, values, c):
-                # A peak that is equal but for rounding, as symmetry makes them, is no better.
-                hoped = found[i, 0] + EQUAL_SHARE * (found[i, 0] - mean)
-                limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, hoped)
-                ascend(mine[c], re, im, full, scratch, limits, at)
-                values[c] = at[0]
-                if at[0] > hoped:
-                    found[i] = at
-                    copy_matrix(mine[c], best[i])
-            done[c] = True
+        levels = (mean, top)
+        _climb_hopeful(on, levels, lowest_z, symmetric, mine, values, best[i], found[i])
+        if symmetric:
+            _look_at_other_side(on, lowest_z, mine, values, best[i], found[i])
         rival[i] = _highest_elsewhere(mine, values, best[i], half_turn)
 
 

@@ -32,6 +32,9 @@ BLOCK = 256
 N_PEAKS = 8
 # Targets whose coarse peak is among the best few are searched with all degrees.
 N_FINALISTS = 3
+# Of a target that a half turn changes by less than this share of its energy, one of two
+# candidates that differ by a half turn tells of both.
+SYMMETRIC_SHARE = 1e-3
 Result = TypeVar("Result")
 
 
@@ -133,7 +136,8 @@ def search(
     unit = target.units()
     targets = [unit[k : k + 1] for k in range(len(target))]
 
-    plan = _Plan(tuple(targets), tuple(half_turns), max_tilt, n_peaks, margins)
+    symmetric = tuple(odd_share(one) < SYMMETRIC_SHARE for one in targets)
+    plan = _Plan(tuple(targets), tuple(half_turns), symmetric, max_tilt, n_peaks, margins)
 
     def block(rows: slice) -> SearchResult:
         extra = None if starts is None else starts[rows]
@@ -146,6 +150,25 @@ def search(
         margin=np.concatenate([part.margin for part in parts]),
         cluster=np.concatenate([part.cluster for part in parts]),
     )
+
+
+def odd_share(target: Coupled) -> float:
+    """Share of one function's energy that changes sign with a half turn about z.
+
+    Examples
+    --------
+    >>> from reflfield.sphere.coupling import couple
+    >>> along_z, along_x = np.zeros((2, 1, 4, 1))
+    >>> along_z[0, 2], along_x[0, 3] = 1.0, 1.0
+    >>> odd_share(couple(along_z)), odd_share(couple(along_x))
+    (0.0, 1.0)
+    """
+    odd, total = 0.0, 0.0
+    for j, block in enumerate(target.blocks):
+        energy = np.sum(block[0].astype(np.float64) ** 2, axis=1)
+        odd += float(energy[(j + 1) % 2 :: 2].sum())
+        total += float(energy.sum())
+    return odd / total if total > 0 else 0.0
 
 
 def map_blocks(
@@ -180,6 +203,7 @@ class _Plan:
 
     targets: tuple[Coupled, ...]
     half_turns: tuple[bool, ...]
+    symmetric: tuple[bool, ...]
     max_tilt: float | None
     n_peaks: int
     margins: bool
@@ -265,7 +289,7 @@ def _keep_better(
         candidates.first,
         candidates.rotations,
         lowest_z_of(plan.max_tilt),
-        bool(plan.half_turns) and plan.half_turns[k],
+        (bool(plan.half_turns) and plan.half_turns[k], plan.symmetric[k]),
         degree_arrays(min(n_degrees, APPROACH_DEGREES), dtype),
         degree_arrays(n_degrees, dtype),
         top,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.comparison.residual import sample_error
-from reflfield.factorization import Completion
 from reflfield.field.building import (
     BaseSurface,
     FittedReflectance,
@@ -17,11 +17,12 @@ from reflfield.field.building import (
     build_field,
     quantisation_error,
 )
-from reflfield.field.compression import CompressionOptions, cluster_completed
+from reflfield.field.compression import CompressionOptions
 from reflfield.field.file import PackedSizes
 from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
 from reflfield.field.rate import field_of_quality, field_of_size
+from reflfield.observations.reading import TexelReader
 from reflfield.progress import track
 from reflfield.stages import versions
 from reflfield.steps.job import Job
@@ -33,6 +34,10 @@ CLUSTERS_TRIED = (1, 2, 4, 8, 16)
 COMPONENTS_TRIED = 10
 # Samples that the search for a quality looks at; the result is measured on more.
 SAMPLES_MEASURED = 100_000
+# Quantisation step over the residual that leaves the quality of a model as it is.
+FINE_SHARE = 1 / 64
+# 0 dB would not be asked for at all.
+LEAST_PSNR = 0.01
 # A field found for a quality is taken to reach it within this.
 CLOSE_DB = 0.005
 
@@ -109,23 +114,39 @@ class FieldMaker:
         found = sample_error(field, job.base_reader, job.seen_texels, SAMPLES_MEASURED)
         return found.psnr_ldr
 
+    def quality_of(self, model: ClusteredModel, reader: TexelReader) -> float:
+        """LDR PSNR on the samples of a model that is hardly quantised, dB."""
+        step = FINE_SHARE * model.residuals[-1]
+        return self.quality(self.build(model, reader.local_from_world, step))
+
     def chosen(
-        self, found: Completion, coefficients: Floats, frames: Floats, counts: tuple[int, int]
+        self,
+        fitted: Callable[[CompressionOptions], ClusteredModel],
+        frames: Floats,
+        gain: float,
     ) -> CompressionOptions:
         """Clusters and components with which completed texels make the best field.
 
         The best of a size has the least error; of a quality, the fewest bytes.
+
+        Parameters
+        ----------
+        fitted : callable
+            From options to the model of the completed texels.
+        frames : (n_texels, 3, 3) float32
+        gain : float
+            By which the fit to the samples raises the quality of a model, dB.
         """
-        seen, options = self.job.seen_texels, self.options
-        tried = [n for n in CLUSTERS_TRIED if n == 1 or n * COMPONENTS_TRIED <= len(seen)]
+        n_seen, options = len(self.job.seen_texels), self.options
+        tried = [n for n in CLUSTERS_TRIED if n == 1 or n * COMPONENTS_TRIED <= n_seen]
+        goal = max(options.psnr - gain, LEAST_PSNR) if options.psnr else 0.0
+        maker = replace(self, options=replace(options, psnr=goal))
         candidates = []
         for n in track(tried, len(tried), "clusters for the size"):
             wanted = replace(options, n_clusters=n, n_components=COMPONENTS_TRIED)
-            model = cluster_completed(
-                found, coefficients, seen, counts, wanted, self.job.options.seed
-            )
-            field = self.made(model, frames)
-            candidates.append((self._cost(field, model, frames), n, components_used(field)))
+            model = fitted(wanted)
+            field = maker.made(model, frames)
+            candidates.append((maker._cost(field, model, frames), n, components_used(field)))
         _, n_clusters, n_components = min(candidates)
         return replace(options, n_clusters=n_clusters, n_components=n_components)
 

@@ -536,20 +536,33 @@ def fitted_model(
     seen = job.seen_texels
     reader = job.base_reader.rotated(local_frames(job, found.frames.local_from_base))
     counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
-    if maker.searches:
-        options = maker.chosen(
-            found.completion, found.coefficients, reader.local_from_world, counts
+    free, fits = found.frames.free, options.fits_samples(job.observed.count() / len(seen))
+
+    def on_grid(options: CompressionOptions) -> ClusteredModel:
+        return cluster_completed(
+            found.completion, found.coefficients, seen, counts, options, job.options.seed
         )
-    model = cluster_completed(
-        found.completion, found.coefficients, seen, counts, options, job.options.seed
-    )
-    if options.fits_samples(job.observed.count() / len(seen)):
-        model, reader = _fitted_to_samples(job, model, reader, found.frames.free, blocks)
+
+    if maker.searches:
+        gain = 0.0
+        if options.psnr and fits:
+            model = on_grid(options)
+            fitted = _fitted_to_samples(job, model, reader, free, blocks, " for the quality")
+            gain = maker.quality_of(*fitted) - maker.quality_of(model, reader)
+        options = maker.chosen(on_grid, reader.local_from_world, gain)
+    model = on_grid(options)
+    if fits:
+        model, reader = _fitted_to_samples(job, model, reader, free, blocks)
     return fill_unobserved(model, job.texels.position, seen), reader
 
 
 def _fitted_to_samples(
-    job: Job, model: ClusteredModel, reader: TexelReader, free: Indices, blocks: Blocks
+    job: Job,
+    model: ClusteredModel,
+    reader: TexelReader,
+    free: Indices,
+    blocks: Blocks,
+    name: str = "",
 ) -> tuple[ClusteredModel, TexelReader]:
     """Fit to the samples, in frames that are improved on the way where they are free."""
     options = job.options.compression.samples
@@ -559,7 +572,7 @@ def _fitted_to_samples(
     for i, part in enumerate(parts):
         if i > 0:
             better = blocks.map(
-                "frames against the model",
+                f"frames against the model{name}",
                 turned_block,
                 SampleFit(reader, model, spread),
                 reader.blocks_of(free),
@@ -567,7 +580,7 @@ def _fitted_to_samples(
             frames = reader.local_from_world.copy()
             frames[free] = better.joined("frames")
             reader = reader.rotated(frames)
-        model = _fitted_once(job, model, reader, part, blocks, f", part {i + 1}")
+        model = _fitted_once(job, model, reader, part, blocks, f"{name}, part {i + 1}")
     return model, reader
 
 

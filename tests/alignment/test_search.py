@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment import search
+from reflfield.alignment import search, searching
 from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
-from reflfield.alignment.searching import rotation_about
+from reflfield.alignment.searching import odd_share, rotation_about
 from reflfield.errors import InputError, ShapeError
-from reflfield.sphere.coupling import couple, rotate_coupled
+from reflfield.sphere.coupling import Coupled, couple, rotate_coupled, uncouple
 from reflfield.sphere.rotations import rotation_angle
 from reflfield.sphere.wigner import rotation_blocks
 
@@ -109,6 +109,48 @@ def test_found_maximum_is_the_global_one(rng):
 
 
 @pytest.mark.stability
+def nearly_symmetric(target, odd):
+    """What changes sign with a half turn about z, scaled."""
+    blocks = [block.copy() for block in target.blocks]
+    for j, block in enumerate(blocks):
+        block[:, (j + 1) % 2 :: 2] *= odd
+    return Coupled(target.band_limits, tuple(blocks))
+
+
+@pytest.mark.parametrize("odd", [0.0, 1e-3, 0.02])
+def test_of_two_sides_that_hardly_differ_the_better_is_found(odd, rng):
+    target = nearly_symmetric(couple(lobes(rng, 1, 6)), odd)
+    assert odd_share(target) < searching.SYMMETRIC_SHARE
+    truth = Rotation.random(100, random_state=5).as_matrix()
+    result = search(turned_copies(target, truth), target)
+    found = result.rotations
+    if odd == 0.0:
+        other = found @ np.diag([-1.0, -1.0, 1.0])
+        assert np.minimum(error_of(found, truth), error_of(other, truth)).max() < 0.05
+    else:
+        assert error_of(found, truth).max() < 0.05
+    # The odd part counts against the other side twice, whose peak lies a little aside.
+    np.testing.assert_allclose(result.margin, 2 * odd_share(target), rtol=0.03, atol=1e-6)
+
+
+@pytest.mark.parametrize("half_turns", [(), (True,)])
+def test_climbing_one_of_two_sides_loses_nothing(half_turns, rng, monkeypatch):
+    target = nearly_symmetric(couple(lobes(rng, 1, 6)), 0.02)
+    truth = Rotation.random(100, random_state=6).as_matrix()
+    source = turned_copies(target, truth)
+    noise = 0.3 * lobes(rng, 100, 6)
+    source = couple(uncouple(source) + noise)
+    short = search(source, target, half_turns=half_turns)
+    monkeypatch.setattr(searching, "SYMMETRIC_SHARE", 0.0)
+    full = search(source, target, half_turns=half_turns)
+    # Of two sides within a thousandth, the full search keeps the one that it climbs first.
+    assert np.all(short.score >= full.score * (1 - 1e-6))
+    same = short.score <= full.score * (1 + 1e-6)
+    assert same.mean() > 0.9
+    assert error_of(short.rotations, full.rotations)[same].max() < 0.05
+    np.testing.assert_allclose(short.margin, full.margin, atol=5e-3)
+
+
 @pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6, 1e12])
 def test_scale_does_not_matter(scale, rng):
     target = couple(lobes(rng, 1, 5, np.float32))

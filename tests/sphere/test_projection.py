@@ -57,6 +57,23 @@ def test_filling_keeps_observed_samples_and_ignores_what_stands_under_the_others
     assert np.median(error) < 0.1
 
 
+@pytest.mark.parametrize("gaps", ["scattered", "one side"])
+def test_filling_leaves_little_of_a_wrong_prior_and_never_overshoots(gaps, rng):
+    smooth = np.exp(GRID @ np.array([0.3, 0.2, 0.5])).astype("f4")
+    samples = np.outer(smooth, smooth)[None]
+    scattered = rng.random(samples.shape) < 0.5
+    one_side = np.broadcast_to((GRID[:, 0] < 0.1)[:, None], samples.shape)
+    observed = scattered if gaps == "scattered" else one_side
+    projector = Projector(GRID, GRID, (4, 4))
+    # A prior that says nothing: all of the missing samples is error at first.
+    filled = projector.fill(np.where(observed, samples, np.nan), np.zeros((81, 81), "f4"))
+    inside = GRID[:, 2] > 0.3
+    error = (filled / samples - 1)[:, inside][:, :, inside]
+    left = np.sqrt(np.mean(error[~observed[:, inside][:, :, inside]] ** 2))
+    assert left < (0.2 if gaps == "scattered" else 1.0)
+    assert np.abs(filled).max() < 1.5 * samples.max()
+
+
 def test_direction_that_does_not_vary_has_one_coefficient_its_mean(rounding):
     projector = Projector(GRID[40:41], GRID, (1, 5))
     coefficients = projector.project(np.ones((1, 1, 81)))
