@@ -119,13 +119,17 @@ class FieldMaker:
         step = FINE_SHARE * model.residuals[-1]
         return self.quality(self.build(model, reader.local_from_world, step))
 
-    def chosen(
+    def size_of(self, model: ClusteredModel, reader: TexelReader) -> int:
+        """Bytes of the field of a model, as it was asked for."""
+        return PackedSizes().of(self.made(model, reader.local_from_world))
+
+    def ranked(
         self,
         fitted: Callable[[CompressionOptions], ClusteredModel],
         frames: Floats,
         gain: float,
-    ) -> CompressionOptions:
-        """Clusters and components with which completed texels make the best field.
+    ) -> list[CompressionOptions]:
+        """Clusters and components with which completed texels make good fields, best first.
 
         The best of a size has the least error; of a quality, the fewest bytes.
 
@@ -147,8 +151,10 @@ class FieldMaker:
             model = fitted(wanted)
             field = maker.made(model, frames)
             candidates.append((maker._cost(field, model, frames), n, components_used(field)))
-        _, n_clusters, n_components = min(candidates)
-        return replace(options, n_clusters=n_clusters, n_components=n_components)
+        return [
+            replace(options, n_clusters=n, n_components=used)
+            for _, n, used in sorted(candidates)
+        ]
 
     def _cost(self, field: ReflectanceField, model: ClusteredModel, frames: Floats) -> float:
         """What is to be least: the error, or the bytes; in dB below the goal if missed."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,17 +24,11 @@ from reflfield.config import Resources
 from reflfield.factorization import Completion, complete
 from reflfield.field.compression import (
     CompressionOptions,
-    cluster_completed,
-    fill_unobserved,
 )
 from reflfield.field.file import open_field, write_field
 from reflfield.field.fit import (
     ClusteredModel,
-    SampleFitOptions,
-    fit_basis,
-    solve_coefficients,
 )
-from reflfield.field.frames import improved_block as turned
 from reflfield.observations.projection import Projection, project_photographs
 from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot
@@ -44,6 +37,7 @@ from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain
 from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
+from reflfield.steps.fitting import AlignedFrames, Resampled, fitted_model, local_frames
 from reflfield.steps.job import Job
 from reflfield.steps.memory import columns_at_once, writers_at_once
 from reflfield.steps.options import AlignmentOptions
@@ -431,43 +425,10 @@ def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
     return write_compressed(found, FieldMaker(job, alike, made_with), folder)
 
 
-@dataclass(frozen=True, eq=False)
-class AlignedFrames:
-    """Frames that a field is fitted in.
-
-    Parameters
-    ----------
-    local_from_base : (n_texels, 3, 3) float64
-    free : (k,) int
-        Texels whose frames were found, and may be improved while the field is fitted.
-    """
-
-    local_from_base: NDArray[np.float64]
-    free: Indices
-
-
 def aligned_frames(job: Job) -> AlignedFrames:
     """What the alignment has found."""
     stored = job.result("alignment", "alignment.npz")
     return AlignedFrames(stored["local_from_base"], np.flatnonzero(stored["aligned"]))
-
-
-@dataclass(frozen=True, eq=False)
-class Resampled:
-    """Texels on the grids of their frames, what was not observed of them filled.
-
-    Parameters
-    ----------
-    frames : AlignedFrames
-    completion : Completion
-        Of the texels that shape the basis.
-    coefficients : (n_texels, rank) float32
-        Of all texels in that basis.
-    """
-
-    frames: AlignedFrames
-    completion: Completion
-    coefficients: Floats
 
 
 def resampled(
@@ -515,136 +476,9 @@ def write_compressed(found: Resampled, maker: FieldMaker, folder: Path) -> dict[
     }
 
 
-def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
-    """Frames of the texels in the world, from their turns against the base frames."""
-    return (local_from_base @ job.texels.local_from_world).astype(np.float32)
-
-
 def write_model(path: Path, model: ClusteredModel, frames: Floats) -> None:
     """Store a model before it is quantised, and its frames."""
     arrays: dict[str, Any] = {
         entry.name: np.asarray(getattr(model, entry.name)) for entry in fields(model)
     }
     np.savez(path, local_from_world=frames, **arrays)
-
-
-def fitted_model(
-    maker: FieldMaker, found: Resampled, blocks: Blocks
-) -> tuple[ClusteredModel, TexelReader]:
-    """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
-    job, options = maker.job, maker.options
-    seen = job.seen_texels
-    reader = job.base_reader.rotated(local_frames(job, found.frames.local_from_base))
-    counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
-    free, fits = found.frames.free, options.fits_samples(job.observed.count() / len(seen))
-
-    def on_grid(options: CompressionOptions) -> ClusteredModel:
-        return cluster_completed(
-            found.completion, found.coefficients, seen, counts, options, job.options.seed
-        )
-
-    if maker.searches:
-        gain = 0.0
-        if options.psnr and fits:
-            model = on_grid(options)
-            fitted = _fitted_to_samples(job, model, reader, free, blocks, " for the quality")
-            gain = maker.quality_of(*fitted) - maker.quality_of(model, reader)
-        options = maker.chosen(on_grid, reader.local_from_world, gain)
-    model = on_grid(options)
-    if fits:
-        model, reader = _fitted_to_samples(job, model, reader, free, blocks)
-    return fill_unobserved(model, job.texels.position, seen), reader
-
-
-def _fitted_to_samples(
-    job: Job,
-    model: ClusteredModel,
-    reader: TexelReader,
-    free: Indices,
-    blocks: Blocks,
-    name: str = "",
-) -> tuple[ClusteredModel, TexelReader]:
-    """Fit to the samples, in frames that are improved on the way where they are free."""
-    options = job.options.compression.samples
-    spread = np.radians(options.frame_spread_deg)
-    parts = options.halves() if len(free) and spread > 0 else (options,)
-    model = replace(model, residuals=())
-    for i, part in enumerate(parts):
-        if i > 0:
-            better = blocks.map(
-                f"frames against the model{name}",
-                turned_block,
-                SampleFit(reader, model, spread),
-                reader.blocks_of(free),
-            )
-            frames = reader.local_from_world.copy()
-            frames[free] = better.joined("frames")
-            reader = reader.rotated(frames)
-        model = _fitted_once(job, model, reader, part, blocks, f"{name}, part {i + 1}")
-    return model, reader
-
-
-def _fitted_once(
-    job: Job,
-    model: ClusteredModel,
-    reader: TexelReader,
-    options: SampleFitOptions,
-    blocks: Blocks,
-    part: str,
-) -> ClusteredModel:
-    """Basis of some texels, then coefficients of all: `fit_samples` by blocks."""
-
-    def basis() -> dict[str, NDArray[Any]]:
-        found = fit_basis(
-            reader.rooted,
-            model,
-            job.seen_texels,
-            reader.sample_bytes_per_texel,
-            options,
-            workers=job.resources.workers,
-            seed=job.options.seed,
-        )
-        return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
-
-    stored: dict[str, Any] = blocks.once(f"basis on the samples{part}", basis)
-    found = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
-    parts = blocks.map(
-        f"coefficients on the samples{part}",
-        coefficients_block,
-        SampleFit(reader, found, 0.0),
-        reader.blocks_of(job.seen_texels),
-    )
-    coefficients = found.coefficients.copy()
-    coefficients[job.seen_texels] = parts.joined("coefficients")
-    return replace(found, coefficients=coefficients)
-
-
-@dataclass(frozen=True, eq=False)
-class SampleFit:
-    """What all blocks of texels share that are fitted to their samples.
-
-    Parameters
-    ----------
-    reader : TexelReader
-    model : ClusteredModel
-    spread : float
-        Of the frames, radians.
-    """
-
-    reader: TexelReader
-    model: ClusteredModel
-    spread: float
-
-
-def turned_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
-    """Frames of some texels, improved against the model."""
-    return {"frames": turned(context.reader, context.model, texels, context.spread)}
-
-
-def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
-    """Coefficients of some texels in the basis of the model."""
-    with ThreadPoolExecutor(1) as pool:
-        found, _ = solve_coefficients(
-            context.reader.rooted(texels), context.model.cluster[texels], context.model, pool
-        )
-    return {"coefficients": found}
