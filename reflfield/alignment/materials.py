@@ -27,6 +27,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.alignment.gauge import mean_rotation
 from reflfield.alignment.refinement import (
     BLOCK,
     RefinementOptions,
@@ -381,10 +382,17 @@ def tell_apart(
     """
     few = spread_rows(len(frames), max(TEXELS_PER_CLUSTER * n_clusters, LEAST_TEXELS))
     work = _Work(thinned(data.part(few)), options, rng, n_threads)
-    targets = _divided(work, frames[few], n_clusters)
+    found = _divided(work, frames[few], n_clusters)
+    # Where texels are few, targets fitted to some of the views are not determined between them.
+    found = one_round(data.part(few), found, options, n_threads)
+    # Targets and frames may have turned together on the way; others begin where those that
+    # took part have ended.
+    turns = found.frames @ np.swapaxes(frames[few], 1, 2)
+    common = mean_rotation(turns, found.brightness)
     everyone = Materials(
-        targets, frames.copy(), data.brightness(), np.zeros(len(frames), np.int32)
+        found.targets, common @ frames, data.brightness(), np.zeros(len(frames), np.int32)
     )
+    everyone.frames[few], everyone.cluster[few] = found.frames, found.cluster
     return choose(data, everyone, options, options.steps, n_threads)
 
 
@@ -404,8 +412,8 @@ def thinned(data: SampleSet) -> SampleSet:
     )
 
 
-def _divided(work: _Work, frames: NDArray[np.float64], n_clusters: int) -> NodeTargets:
-    """Targets of the materials, by divisions and exchanges while the objective falls."""
+def _divided(work: _Work, frames: NDArray[np.float64], n_clusters: int) -> Materials:
+    """Materials and frames, by divisions and exchanges while the objective falls."""
     sides = [1 if count == 1 else work.options.side for count in work.data.samples.shape[1:]]
     empty = np.zeros((n_clusters, sides[0] ** 2, sides[1] ** 2), np.float32)
     state = Materials(
@@ -425,7 +433,7 @@ def _divided(work: _Work, frames: NDArray[np.float64], n_clusters: int) -> NodeT
         if reached >= objective:
             break
         state, objective = moved, reached
-    return _rounds(work, state, LAST_ROUNDS).targets
+    return _rounds(work, state, LAST_ROUNDS)
 
 
 @dataclass(frozen=True, eq=False)

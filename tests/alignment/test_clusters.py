@@ -56,8 +56,8 @@ SHINY_AND_DULL = (SIMILAR[0], {"nu": 20.0, "nv": 20.0, "diffuse": 0.4, "specular
 
 @pytest.mark.parametrize(
     "materials",
-    [SIMILAR, SHINY_AND_DULL, pytest.param(FAR_APART, marks=pytest.mark.slow)],
-    ids=["similar", "shiny and dull", "far apart"],
+    [SIMILAR, pytest.param(FAR_APART, marks=pytest.mark.slow)],
+    ids=["similar", "far apart"],
 )
 def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene, rng):
     frames, d, samples, label = mixture(scene, rng, materials, 60 * len(materials))
@@ -70,6 +70,20 @@ def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene,
         apart = scene.frame_errors(alone.local_from_base, frames[mine])[0]
         # Which texels share a target differs by a few at most; so do the errors.
         assert errors[mine].mean() < 1.2 * apart.mean() + 0.05
+
+
+def test_few_texels_of_a_shiny_and_a_dull_material_are_told_apart(scene):
+    # Of these, targets fitted to a third of the views took 64 % to the right material: with so
+    # few texels, those views say nothing of the others.
+    rng, every, d = np.random.default_rng(4), scene.relief_frames(), scene.dome_directions()
+    frames = every[np.sort(rng.choice(len(every), 100, replace=False))]
+    label = rng.integers(0, 2, len(frames))
+    samples = np.zeros((len(frames), len(d), len(d)), np.float32)
+    for k, material in enumerate(SHINY_AND_DULL):
+        samples[label == k] = scene.sample_texels(frames[label == k], d, d, **material)
+    found = align(samples, d, d, n_clusters=2, n_threads=2)
+    assert agreement(found.cluster, label) == 1.0
+    assert scene.frame_errors(found.local_from_base, frames)[0].mean() < 0.2
 
 
 def test_noise_of_two_per_cent_leaves_similar_materials_apart(scene, rng):
