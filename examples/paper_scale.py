@@ -62,7 +62,7 @@ points = {points}
 """
 # Works of the stages that go texel by texel: all texels that are seen, but for those that
 # shape the basis in the first. Of the other works the number of texels is no matter.
-COMPLETING = "completing all texels"
+SHAPING, COMPLETING = "resampling for the basis", "completing all texels"
 REFINING = "frames on the samples"
 BY_TEXELS = {
     "completion": (COMPLETING,),
@@ -192,6 +192,12 @@ def kept_blocks(out: Path, stage: str) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in folder.glob("*/*.block")}
 
 
+def needed(kept: dict[str, int]) -> int:
+    """Kept blocks that the resumed stage reads: not those that a finished basis is made of."""
+    works = [Path(path).parent.name for path in kept]
+    return len(works) - ("basis" in works) * works.count(SHAPING)
+
+
 def kill_at(running: subprocess.Popen[bytes], out: Path, moment: Moment) -> None:
     """Wait for the moment, and kill the process."""
     stage = out / "stages" / f"{moment.stage}.partial"
@@ -226,10 +232,13 @@ def kill_and_resume(arguments: argparse.Namespace, capture: Path) -> None:
     subprocess.run(command, check=True, stdout=sys.stderr)
     for record in json.loads((out / "timings.json").read_text())["stages"]:
         if (stage := record["name"]) in kept:
+            wanted = needed(kept[stage])
             print(
-                f"{stage}: of {len(kept[stage])} blocks kept at its last kill "
+                f"{stage}: of {wanted} blocks kept at its last kill and needed "
                 f"{record['blocks_resumed']} taken up, {record['blocks_computed']} computed"
             )
+            if record["blocks_resumed"] < wanted:
+                sys.exit(f"{stage}: blocks that the last kill had left were computed again")
     compare(whole, out)
 
 
