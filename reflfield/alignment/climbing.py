@@ -309,7 +309,7 @@ Climbed = tuple[
 ]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def _approach(
     on: Climbed,
     mean: float,
@@ -336,7 +336,7 @@ def _approach(
     return top
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def _climb_hopeful(
     on: Climbed,
     levels: tuple[float, float],
@@ -371,7 +371,7 @@ def _climb_hopeful(
         done[c] = True
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, inline="always")
 def _look_at_other_side(
     on: Climbed,
     lowest_z: float,

@@ -219,8 +219,8 @@ def test_false_sizes_allocate_nothing(path):
 
 
 def test_bombs_are_refused_before_they_are_unpacked(tmp_path):
-    # 40 MB of zeros in 40 kB: allowed only as far as the caller says.
-    field = baked_field(square_surface(1), lambert(0.0), view_side=61, light_side=41)
+    # 5 MB of zeros in some kB: allowed only as far as the caller says.
+    field = baked_field(square_surface(1), lambert(0.0), view_side=31, light_side=21)
     write_field(tmp_path / "bomb.rfld", field)
     with pytest.raises(FieldFileError, match="expected arrays of at most 1000000 bytes"):
         open_field(tmp_path / "bomb.rfld", max_bytes=1_000_000)
