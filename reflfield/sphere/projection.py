@@ -269,8 +269,8 @@ class Projector:
         unobserved samples m towards the band-limited fit P of all; one that goes the share
         :math:`\omega` of the way leaves :math:`1 - \omega\lambda` of their error, where
         :math:`\lambda` are the eigenvalues of :math:`1 - P_{mm}`, between 0 and 1. Twice the
-        way and then once leaves at most an eighth where half the samples are missing at
-        random, :math:`\lambda \ge 1/2`; once each time, a quarter.
+        way and then once leaves an eighth at most for :math:`\lambda \ge 1/2`, about what
+        half of the samples missing at random give; once each time leaves a quarter.
 
         Parameters
         ----------
