@@ -23,11 +23,15 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from reflfield.checks import check_shape
 from reflfield.sphere.harmonics import check_band_limit
+from reflfield.sphere.recombining import Recombination, recombination
 
 BandLimits = tuple[int, int]
+# Coefficients of degrees up to 15 are zero, but for 1e-14 of rounding, or above 1e-9.
+SMALLEST_COEFFICIENT = 1e-12
 
 
 @lru_cache(maxsize=1024)
@@ -256,9 +260,8 @@ def couple(coefficients: NDArray[np.floating]) -> Coupled:
 
     Notes
     -----
-    One dense product per pair (l1, l2): :math:`(\sum (2\ell+1)^2)^2` multiply-adds a
-    function. Three quarters of the matrix are zeros, but a sparse product moves
-    more memory than it saves arithmetic at these sizes.
+    Of the :math:`(\sum (2\ell+1)^2)^2` entries of the matrices of all pairs (l1, l2) a tenth
+    (L = 8) or a twentieth (L = 16) are not zero: orders m1, m2 give :math:`|m_1 \pm m_2|` only.
 
     Examples
     --------
@@ -271,65 +274,38 @@ def couple(coefficients: NDArray[np.floating]) -> Coupled:
     check_band_limit("L_view", limits[0])
     check_band_limit("L_light", limits[1])
     check_shape("coefficients", coefficients, (None, limits[0] ** 2, limits[1] ** 2))
-    n, dtype = len(coefficients), coefficients.dtype
-    plan = _pair_plan(limits)
-    products = coefficients.reshape(n, -1).take(plan.by_pair, axis=1)
-    turned = np.zeros_like(products)
-    for (l1, l2), part in plan.parts:
-        matrix = _coupling_of_dtype(l1, l2, str(dtype))
-        np.matmul(products[:, part], matrix, out=turned[:, part])
-    blocks = (
-        turned.take(columns, axis=1).reshape(n, 2 * j + 1, -1)
-        for j, columns in enumerate(plan.by_degree)
-    )
+    n = len(coefficients)
+    parts = _recombinations(limits, str(coefficients.dtype))[0](coefficients.reshape(n, -1))
+    blocks = (part.reshape(n, 2 * j + 1, -1) for j, part in enumerate(parts))
     return Coupled(limits, tuple(blocks))
 
 
-@dataclass(frozen=True, eq=False)
-class _PairPlan:
-    """Orders of the coefficients: as the samples give them, by pairs (l1, l2), by degrees.
-
-    Parameters
-    ----------
-    parts : tuple of ((l1, l2), slice)
-        Where each pair stands.
-    by_pair : (k,) int64
-        Where each entry of the order by pairs, (m1, m2) within, is taken from.
-    by_degree : tuple of (k_j,) int64
-        Where each entry of degree j, (m, channel), stands in the order by pairs, where
-        (j, m) stand within.
-    """
-
-    parts: tuple[tuple[tuple[int, int], slice], ...]
-    by_pair: NDArray[np.int64]
-    by_degree: tuple[NDArray[np.int64], ...]
-
-
 @lru_cache(maxsize=32)
-def _pair_plan(limits: BandLimits) -> _PairPlan:
-    parts, orders, first = {}, [], 0
-    for l1 in range(limits[0]):
-        for l2 in range(limits[1]):
-            rows, columns = np.arange(l1 * l1, (l1 + 1) ** 2), np.arange(l2 * l2, (l2 + 1) ** 2)
-            orders.append((rows[:, None] * limits[1] ** 2 + columns).ravel())
-            parts[l1, l2] = slice(first, first + len(orders[-1]))
-            first = parts[l1, l2].stop
-    by_degree = [
-        np.stack(
-            [
-                parts[l1, l2].start + j * j - (l1 - l2) ** 2 + np.arange(2 * j + 1)
-                for l1, l2 in pairs
-            ],
-            axis=1,
-        ).ravel()
-        for j, pairs in enumerate(channels(limits))
-    ]
-    return _PairPlan(tuple(parts.items()), np.concatenate(orders), tuple(by_degree))
+def _recombinations(limits: BandLimits, dtype: str) -> tuple[Recombination, Recombination]:
+    """From products, as the samples give them, to degrees j of (m, channel); and back."""
+    k = limits[0] ** 2 * limits[1] ** 2
+    triples = [_entries_of_pair(limits, pair) for pair in np.ndindex(limits)]
+    rows, columns, values = (np.concatenate(one) for one in zip(*triples, strict=True))
+    matrix = csr_array((values, (rows, columns)), shape=(k, k))
+    sizes = [(2 * j + 1) * len(pairs) for j, pairs in enumerate(channels(limits))]
+    back = recombination(matrix.T.tocsr(), [k], dtype)
+    return recombination(matrix, sizes, dtype), back
 
 
-@lru_cache(maxsize=1024)
-def _coupling_of_dtype(l1: int, l2: int, dtype: str) -> NDArray[np.floating]:
-    return np.ascontiguousarray(real_coupling(l1, l2).T.astype(dtype))
+def _entries_of_pair(
+    limits: BandLimits, pair: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Rows, columns and values of the coupling of one pair of degrees."""
+    (l1, l2), matrix = pair, real_coupling(*pair)
+    one, two = np.arange(l1 * l1, (l1 + 1) ** 2), np.arange(l2 * l2, (l2 + 1) ** 2)
+    columns = (one[:, None] * limits[1] ** 2 + two).ravel()
+    rows, first = [], 0
+    for j, pairs in enumerate(channels(limits)):
+        if pair in pairs:
+            rows.append(first + np.arange(2 * j + 1) * len(pairs) + pairs.index(pair))
+        first += (2 * j + 1) * len(pairs)
+    r, c = np.nonzero(np.abs(matrix) > SMALLEST_COEFFICIENT)
+    return np.concatenate(rows)[r], columns[c], matrix[r, c]
 
 
 def uncouple(coupled: Coupled) -> NDArray[np.floating]:
@@ -346,15 +322,9 @@ def uncouple(coupled: Coupled) -> NDArray[np.floating]:
     True
     """
     limits, n = coupled.band_limits, len(coupled)
-    plan = _pair_plan(limits)
     by_degree = np.concatenate([block.reshape(n, -1) for block in coupled.blocks], axis=1)
-    turned = by_degree.take(np.argsort(np.concatenate(plan.by_degree)), axis=1)
-    products = np.zeros_like(turned)
-    for (l1, l2), part in plan.parts:
-        matrix = _coupling_of_dtype(l1, l2, str(coupled.dtype))
-        np.matmul(turned[:, part], matrix.T, out=products[:, part])
-    out = products.take(np.argsort(plan.by_pair), axis=1)
-    return out.reshape(n, limits[0] ** 2, limits[1] ** 2)
+    back = _recombinations(limits, str(coupled.dtype))[1]
+    return back(by_degree)[0].reshape(n, limits[0] ** 2, limits[1] ** 2)
 
 
 def rotate_coupled(coupled: Coupled, blocks: NDArray[np.floating]) -> Coupled:
