@@ -107,15 +107,14 @@ def turned(r: NDArray[np.float64], w: NDArray[np.float64], out: NDArray[np.float
     angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
     scale = 0.5 - angle * angle / 48.0 if angle < 1e-3 else np.sin(0.5 * angle) / angle
     q0, q1, q2, q3 = np.cos(0.5 * angle), w[0] * scale, w[1] * scale, w[2] * scale
-    e = np.zeros((3, 3))
-    e[0, 0], e[1, 1] = 1.0 - 2.0 * (q2 * q2 + q3 * q3), 1.0 - 2.0 * (q1 * q1 + q3 * q3)
-    e[2, 2] = 1.0 - 2.0 * (q1 * q1 + q2 * q2)
-    e[0, 1], e[1, 0] = 2.0 * (q1 * q2 - q0 * q3), 2.0 * (q1 * q2 + q0 * q3)
-    e[0, 2], e[2, 0] = 2.0 * (q1 * q3 + q0 * q2), 2.0 * (q1 * q3 - q0 * q2)
-    e[1, 2], e[2, 1] = 2.0 * (q2 * q3 - q0 * q1), 2.0 * (q2 * q3 + q0 * q1)
+    xx, xy, xz = 1.0 - 2.0 * (q2 * q2 + q3 * q3), q1 * q2 - q0 * q3, q1 * q3 + q0 * q2
+    yx, yy, yz = q1 * q2 + q0 * q3, 1.0 - 2.0 * (q1 * q1 + q3 * q3), q2 * q3 - q0 * q1
+    zx, zy, zz = q1 * q3 - q0 * q2, q2 * q3 + q0 * q1, 1.0 - 2.0 * (q1 * q1 + q2 * q2)
     for i in range(3):
-        for k in range(3):
-            out[i, k] = r[i, 0] * e[0, k] + r[i, 1] * e[1, k] + r[i, 2] * e[2, k]
+        x, y, z = r[i, 0], r[i, 1], r[i, 2]
+        out[i, 0] = x * xx + 2.0 * (y * yx + z * zx)
+        out[i, 1] = y * yy + 2.0 * (x * xy + z * zy)
+        out[i, 2] = z * zz + 2.0 * (x * xz + y * yz)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -207,7 +206,7 @@ def climb(
 
     Rotation i climbs on the series ``rows[i]``; equal rows are best kept together.
     """
-    like, n_entries = series.dtype, tables[0][-1]
+    like, n_entries = series.dtype, tables[1].shape[1]
     re, im = np.zeros(n_entries, like), np.zeros(n_entries, like)
     scratch = (np.zeros(n_entries, like), np.zeros((2, tables[2].size), like))
     for i in range(rows.shape[0]):
@@ -230,15 +229,27 @@ def _cosine_between(a: NDArray[np.float64], b: NDArray[np.float64], half_turn: b
 
 @numba.njit(cache=True, nogil=True)
 def _next_hopeful(
-    hopes: NDArray[np.float64], done: NDArray[np.bool_], mean: float, best: float
+    hopes: NDArray[np.float64],
+    done: NDArray[np.bool_],
+    levels: tuple[float, float, float],
+    found: float,
 ) -> int:
-    """Most promising candidate not yet done, -1 if none comes near the best."""
+    """Most promising candidate not yet done, -1 if none may still rise above `found`."""
+    mean, top, rise = levels
     choice = -1
     for c in range(hopes.shape[0]):
         if not done[c] and (choice < 0 or hopes[c] > hopes[choice]):
             choice = c
-    hopeful = choice >= 0 and hopes[choice] - mean >= HOPEFUL * (best - mean)
-    return choice if hopeful or not np.any(done) else -1
+    if choice < 0 or not np.any(done):
+        return choice
+    near = hopes[choice] - mean >= HOPEFUL * (top - mean)
+    return choice if near and hopes[choice] + rise > _hoped(found, mean) else -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _hoped(found: float, mean: float) -> float:
+    """What beats `found`: a peak equal but for rounding, as symmetry makes them, does not."""
+    return found + EQUAL_SHARE * (found - mean)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -339,7 +350,7 @@ def _approach(
 @numba.njit(cache=True, nogil=True, inline="always")
 def _climb_hopeful(
     on: Climbed,
-    levels: tuple[float, float],
+    levels: tuple[float, float, float],
     lowest_z: float,
     symmetric: bool,
     mine: NDArray[np.float64],
@@ -349,19 +360,19 @@ def _climb_hopeful(
 ) -> None:
     """Climb candidates, from the most promising on, while they may still be the best.
 
-    `levels`: the mean of the series, and the highest value so far.
+    `levels`: the mean of the series, the highest value of the approach, and the most that
+    the degrees which that leaves out can add to any.
     """
     re, im, tables, scratch = on
-    mean, top = levels
+    mean = levels[0]
     hopes, done, at = values.copy(), np.zeros(len(mine), np.bool_), np.zeros(11)
     found[0] = -np.inf
     while True:
-        c = _next_hopeful(hopes, done, mean, top)
+        c = _next_hopeful(hopes, done, levels, found[0])
         if c < 0:
             break
         if not _already_there(mine, done, values, c, symmetric):
-            # A peak that is equal but for rounding, as symmetry makes them, is no better.
-            hoped = found[0] + EQUAL_SHARE * (found[0] - mean)
+            hoped = _hoped(found[0], mean)
             limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, hoped)
             ascend(mine[c], re, im, tables, scratch, limits, at)
             values[c] = at[0]
@@ -401,6 +412,7 @@ def climb_best(
     rows: NDArray[np.int64],
     first: NDArray[np.int64],
     rotations: NDArray[np.float64],
+    rises: NDArray[np.float64],
     lowest_z: float,
     half_turns: tuple[bool, bool],
     low: DegreeArrays,
@@ -416,12 +428,15 @@ def climb_best(
     all degrees while they may still be the best. `best` (k, 3, 3) receives the rotations,
     `found` (k, 11) their derivatives, and `rival` (k,) the highest value that ended elsewhere.
 
+    `rises` (k,): the most that the degrees beyond the low ones can add; infinite, if the
+    rivals are to be known as well as that.
+
     `half_turns`: whether rotations that differ by a half turn about z count as one in
     `rival`; and whether the series hardly change with it: of two such candidates only one is
     climbed, and both sides of the best are looked at in the end.
     """
     half_turn, symmetric = half_turns
-    like, n_entries, n_low = series.dtype, full[0][-1], low[0][-1]
+    like, n_entries, n_low = series.dtype, full[1].shape[1], low[1].shape[1]
     re, im = np.zeros(n_entries, like), np.zeros(n_entries, like)
     re_low, im_low = np.zeros(n_low, like), np.zeros(n_low, like)
     scratch = (np.zeros(n_entries, like), np.zeros((2, full[2].size), like))
@@ -433,7 +448,7 @@ def climb_best(
         complex_spectrum(series[rows[i]], low[0], re_low, im_low)
         top = _approach(on_low, mean, lowest_z, symmetric, mine, values)
         complex_spectrum(series[rows[i]], full[0], re, im)
-        levels = (mean, top)
+        levels = (mean, top, rises[i])
         _climb_hopeful(on, levels, lowest_z, symmetric, mine, values, best[i], found[i])
         if symmetric:
             _look_at_other_side(on, lowest_z, mine, values, best[i], found[i])

@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 
 from reflfield.errors import InputError
 from reflfield.sphere.coupling import Coupled
-from reflfield.sphere.wigner import block_offsets, euler_from_matrix, fill_phases, fill_wigner_d
+from reflfield.sphere.wigner import Turn, block_offsets, euler_turns, fill_wigner_d
 
 
-def spectrum(source: Coupled, target: Coupled) -> NDArray[np.floating]:
+def spectrum(
+    source: Coupled, target: Coupled, factors: NDArray[np.float64] | None = None
+) -> NDArray[np.floating]:
     r"""Series of the correlation of many functions with one target.
 
     Parameters
@@ -33,6 +35,8 @@ def spectrum(source: Coupled, target: Coupled) -> NDArray[np.floating]:
         n functions.
     target : Coupled
         One function.
+    factors : (n,) float64, optional
+        What each series is multiplied with.
 
     Returns
     -------
@@ -51,9 +55,12 @@ def spectrum(source: Coupled, target: Coupled) -> NDArray[np.floating]:
         )
     offsets = block_offsets(source.n_degrees)
     out = np.zeros((len(source), offsets[-1]), source.dtype)
+    times = np.ones(len(source)) if factors is None else factors
+    column = times.astype(source.dtype)[:, None]
     for j, (a, b) in enumerate(zip(source.blocks, target.blocks, strict=True)):
         product = a.reshape(-1, a.shape[2]) @ b[0].T.astype(a.dtype)
-        out[:, offsets[j] : offsets[j + 1]] = product.reshape(len(source), -1)
+        part = out[:, offsets[j] : offsets[j + 1]]
+        np.multiply(product.reshape(len(source), -1), column, out=part)
     return out
 
 
@@ -68,7 +75,7 @@ def complex_spectrum(
 
     As many degrees as `row_start` (see `DegreeTables`) has; the series may have more.
     """
-    offset, width = 0, row_start[1]
+    offset, width = 0, row_start[1] - row_start[0]
     zero, one = series.dtype.type(0.0), series.dtype.type(1.0)
     root = series.dtype.type(np.sqrt(0.5))
     for j in range(row_start.shape[0] - 1):
@@ -104,25 +111,23 @@ def complex_spectrum(
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill_plane(
-    alpha: float,
-    gamma: float,
-    left: NDArray[np.floating],
-    right: NDArray[np.floating],
-    phases: NDArray[np.floating],
-) -> None:
+def _fill_plane(alpha: Turn, gamma: Turn, width: int, phases: NDArray[np.floating]) -> None:
     """Cos and sin of m alpha + n gamma for all m >= 0 and n, rows as in `DegreeTables`."""
-    width = right.shape[1]
-    fill_phases(alpha, 0, left)
-    fill_phases(gamma, width // 2, right)
-    for m in range(left.shape[1]):
-        c, s = left[0, m], left[1, m]
-        a, b = right[0], right[1]
-        cosine = phases[0, m * width : (m + 1) * width]
-        sine = phases[1, m * width : (m + 1) * width]
+    # By multiplication: rounding of float64 grows with the order, far below float32's.
+    re, im = 1.0, 0.0
+    for n in range(width // 2):
+        phases[0, width // 2 + n], phases[1, width // 2 + n] = re, im
+        phases[0, width // 2 - n], phases[1, width // 2 - n] = re, -im
+        re, im = re * gamma[0] - im * gamma[1], re * gamma[1] + im * gamma[0]
+    a, b = phases[0, :width], phases[1, :width]
+    re, im = alpha
+    for begin in range(width, phases.shape[1], width):
+        c, s = phases.dtype.type(re), phases.dtype.type(im)
+        cosine, sine = phases[0, begin : begin + width], phases[1, begin : begin + width]
         for k in range(width):
             cosine[k] = c * a[k] - s * b[k]
             sine[k] = s * a[k] + c * b[k]
+        re, im = re * alpha[0] - im * alpha[1], re * alpha[1] + im * alpha[0]
 
 
 # Reordering of sums only.
@@ -149,16 +154,21 @@ def _add_degree(
     # Shifted slices: no index can be negative, so the loop becomes vector instructions.
     n_entries = last - first
     re_part, im_part = re_all[first:last], im_all[first:last]
-    cosine, sine = phases[0, 2 : 2 + n_entries], phases[1, 2 : 2 + n_entries]
-    order, up, down = ladder[0, first:last], ladder[1, first:last], ladder[2, first:last]
-    up2, down2 = ladder[3, first:last], ladder[4, first:last]
+    cosine, sine = phases[0, :n_entries], phases[1, :n_entries]
+    # c-(n) = c+(n - 1): what is read again costs less than a table of its own.
+    order, up, above_up = (
+        ladder[0, first:last],
+        ladder[1, first:last],
+        ladder[1, first + 1 : last + 1],
+    )
+    down, below_down = ladder[1, first - 1 : last], ladder[1, first - 2 : last]
     below2, below, here = d[first - 2 : last], d[first - 1 : last], d[first:last]
     above, above2 = d[first + 1 : last + 1], d[first + 2 : last + 2]
     for k in range(n_entries):
         re = re_part[k] * cosine[k] + im_part[k] * sine[k]
         im = im_part[k] * cosine[k] - re_part[k] * sine[k]
         u, v = up[k] * above[k], down[k] * below[k]
-        p, q = up2[k] * above2[k], down2[k] * below2[k]
+        p, q = (up[k] * above_up[k]) * above2[k], (down[k] * below_down[k]) * below2[k]
         both, difference = u + v, u - v
         n_re, n_im = order[k] * re, order[k] * im
         value += re * here[k]
@@ -200,21 +210,19 @@ def derivatives(
 
     `re` and `im` are from `complex_spectrum`, `d` (zero at first) and `phases` are scratch.
     """
-    width, n_degrees = row_start[1], row_start.shape[0] - 1
-    left, right = np.zeros((2, n_degrees), d.dtype), np.zeros((2, width), d.dtype)
-    alpha, beta, gamma = euler_from_matrix(rotation)
+    alpha, beta, gamma = euler_turns(rotation)
     fill_wigner_d(beta, row_start, recursion, edge, d)
-    _fill_plane(alpha, gamma, left, right, phases)
-    f = np.zeros(10)
-    for j in range(n_degrees):
-        # Two entries less at each end: the margins of the rows are zero.
-        first, last = row_start[j] + 2, row_start[j + 1] - 2
-        _add_degree(re, im, phases, d, ladder, first, last, j * (j + 1.0), f)
+    _fill_plane(alpha, gamma, edge.shape[1], phases)
+    for i in range(10):
+        out[i] = 0.0
+    for j in range(row_start.shape[0] - 1):
+        first, last = row_start[j], row_start[j + 1]
+        _add_degree(re, im, phases, d, ladder, first, last, j * (j + 1.0), out)
     # From axes turned by gamma, in which the sums are taken, to the body's own.
-    c, s = np.cos(gamma), np.sin(gamma)
-    out[0], out[3], out[6] = f[0], f[3], f[6]
-    out[1], out[2] = c * f[1] + s * f[2], c * f[2] - s * f[1]
-    out[4] = c * c * f[4] + s * s * f[5] + 2.0 * c * s * f[7]
-    out[5] = s * s * f[4] + c * c * f[5] - 2.0 * c * s * f[7]
-    out[7] = c * s * (f[5] - f[4]) + (c * c - s * s) * f[7]
-    out[8], out[9] = c * f[8] + s * f[9], c * f[9] - s * f[8]
+    c, s = gamma
+    x, y, xx, yy, xy, xz, yz = out[1], out[2], out[4], out[5], out[7], out[8], out[9]
+    out[1], out[2] = c * x + s * y, c * y - s * x
+    out[4] = c * c * xx + s * s * yy + 2.0 * c * s * xy
+    out[5] = s * s * xx + c * c * yy - 2.0 * c * s * xy
+    out[7] = c * s * (yy - xx) + (c * c - s * s) * xy
+    out[8], out[9] = c * xz + s * yz, c * yz - s * xz

@@ -222,9 +222,11 @@ def _search_block(
     source: Coupled, start: NDArray[np.float64] | None, plan: _Plan
 ) -> SearchResult:
     """Search of a few functions against all (unit) targets."""
-    norms = source.norms()
+    parts = source.degree_norms()
+    norms = np.linalg.norm(parts, axis=1)
+    inverse = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
     # Unit series, so that the float32 kernels never meet 1e-12 or 1e12.
-    series = [_unit_series(source, norms, target) for target in plan.targets]
+    series = [spectrum(source, target, inverse) for target in plan.targets]
     coarse = [coarse_peaks(s, source.n_degrees, plan.n_peaks, plan.max_tilt) for s in series]
     best = SearchResult(
         rotations=np.tile(np.eye(3), (len(source), 1, 1)),
@@ -237,7 +239,8 @@ def _search_block(
     for k in range(len(plan.targets)):
         final = np.flatnonzero(rank[k] < N_FINALISTS)
         candidates = _candidates(coarse[k][0], final, start)
-        _keep_better(best, series[k], candidates, k, plan)
+        rise = inverse * _rise(parts, plan.targets[k])
+        _keep_better(best, series[k], rise, candidates, k, plan)
     nothing = ~(norms > 0) | ~np.isfinite(best.score)
     best.score[nothing] = 0.0
     best.margin[nothing] = 0.0
@@ -245,14 +248,9 @@ def _search_block(
     return best
 
 
-def _unit_series(
-    source: Coupled, norms: NDArray[np.float64], target: Coupled
-) -> NDArray[np.floating]:
-    """Series of unit functions; zero for zero functions."""
-    series = spectrum(source, target)
-    factors = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
-    series *= factors.astype(series.dtype)[:, None]
-    return series
+def _rise(norms: NDArray[np.float64], target: Coupled) -> NDArray[np.float64]:
+    r"""Most that degrees beyond those of the approach add: :math:`\sum_j \|A_j\| \|B_j\|`."""
+    return norms[:, APPROACH_DEGREES:] @ target.degree_norms()[0, APPROACH_DEGREES:]
 
 
 def _candidates(
@@ -272,22 +270,28 @@ def _candidates(
 def _keep_better(
     best: SearchResult,
     series: NDArray[np.floating],
+    rise: NDArray[np.float64],
     candidates: _Candidates,
     k: int,
     plan: _Plan,
 ) -> None:
-    """Update `best` in place with target k for the functions that have candidates."""
+    """Update `best` in place with target k for the functions that have candidates.
+
+    `rise` (n,) is the most that the degrees beyond those of the approach can add.
+    """
     who = candidates.rows
     if len(who) == 0:
         return
     n_degrees, dtype = degrees_of(series), str(series.dtype)
     top, at_top = np.zeros((len(who), 3, 3)), np.zeros((len(who), 11))
     rival = np.zeros(len(who))
+    rises = np.full(len(who), np.inf) if plan.margins else rise[who]
     climb_best(
         series,
         who,
         candidates.first,
         candidates.rotations,
+        rises,
         lowest_z_of(plan.max_tilt),
         (bool(plan.half_turns) and plan.half_turns[k], plan.symmetric[k]),
         degree_arrays(min(n_degrees, APPROACH_DEGREES), dtype),

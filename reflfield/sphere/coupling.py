@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -153,6 +154,17 @@ def real_coupling(l1: int, l2: int) -> NDArray[np.float64]:
     return out
 
 
+# Reordering of sums only.
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _sum_squares(rows: NDArray[np.floating], out: NDArray[np.float64]) -> None:
+    """Sum of squares of each row, in double precision."""
+    for i in range(rows.shape[0]):
+        total = 0.0
+        for k in range(rows.shape[1]):
+            total += np.float64(rows[i, k]) * np.float64(rows[i, k])
+        out[i] = total
+
+
 @dataclass(frozen=True, eq=False)
 class Coupled:
     """Coupled coefficients of many functions of two directions.
@@ -192,8 +204,14 @@ class Coupled:
 
     def norms(self) -> NDArray[np.float64]:
         """(n,) root of the sum of squares, the function's L2 norm."""
-        squares = [np.einsum("nij,nij->n", b, b, dtype=np.float64) for b in self.blocks]
-        return np.sqrt(np.sum(squares, axis=0))
+        return np.linalg.norm(self.degree_norms(), axis=1)
+
+    def degree_norms(self) -> NDArray[np.float64]:
+        """(n, n_degrees) norms of the parts of each degree."""
+        out = np.zeros((len(self), self.n_degrees))
+        for j, block in enumerate(self.blocks):
+            _sum_squares(block.reshape(len(self), -1), out[:, j])
+        return np.sqrt(out)
 
     def units(self) -> Coupled:
         """Each function over its norm; zero functions stay zero."""

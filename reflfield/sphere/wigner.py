@@ -24,13 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
 
-# Room left and right of each row of stored d, so that orders n - 2 .. n + 2 can be
-# read without a test.
-ROW_MARGIN = 2
+# Rows of stored d are whole cache lines of single precision, for vector instructions.
+LINE = 16
 MAX_DEGREE = 256
 # Near beta = 0 and pi the two solutions of the recursion grow alike and rounding grows
 # with the square of the degree; there the matrix is made as a product of two others.
 DEGENERATE_SINE = 0.1
+
+
+# Cosine and sine of an angle.
+Turn = tuple[float, float]
 
 
 def block_offsets(degree_limit: int) -> NDArray[np.int64]:
@@ -137,8 +140,9 @@ class DegreeTables:
 
     Only rows m >= 0 are kept: those of negative order follow by symmetry. The
     row of (j, m) begins at ``row_start[j] + m * width``, and order n stands ``width // 2 + n``
-    farther, for all degrees alike: so loops run over whole degrees. What no order
-    -j .. j fills is zero.
+    farther, for all degrees alike: so loops run over whole degrees, and rows are whole cache
+    lines. What no order -j .. j fills is zero. A line of zeros stands before the first row
+    and after the last, so that orders n - 2 .. n + 2 can be read without a test.
 
     Parameters
     ----------
@@ -150,9 +154,8 @@ class DegreeTables:
         d^j = (recursion[0] * cos(beta) - recursion[1]) d^{j-1} - recursion[2] d^{j-2}.
     edge : (degree_limit, width) float
         Factors of the last row of each degree.
-    ladder : (5, n) float
-        Order n; c+; c-; c+ c+; c- c-, the matrix elements of the generators that the
-        derivatives need.
+    ladder : (2, n) float
+        Order n; c+, the matrix element of the generator from n to n + 1, which is c- of n + 1.
     """
 
     degree_limit: int
@@ -169,24 +172,33 @@ def degree_tables(degree_limit: int, dtype: str = "float32") -> DegreeTables:
     Examples
     --------
     >>> degree_tables(3).row_start
-    array([ 0,  9, 27, 54])
+    array([ 16,  32,  64, 112])
     """
     degrees = np.arange(degree_limit + 1, dtype=np.int64)
     width = row_width(degree_limit)
-    start = width * (degrees * (degrees + 1) // 2)
-    recursion = np.zeros((3, start[-1]))
-    ladder = np.zeros((5, start[-1]))
+    start = LINE + width * (degrees * (degrees + 1) // 2)
+    recursion = np.zeros((3, start[-1] + LINE))
+    ladder = np.zeros((2, start[-1] + LINE))
     edge = np.zeros((degree_limit, width))
     for j in range(degree_limit):
         part = slice(start[j], start[j + 1])
         recursion[:, part] = _recursion_of_degree(j, width).reshape(3, -1)
-        ladder[:, part] = _ladder_of_degree(j, width).reshape(5, -1)
+        ladder[:, part] = _ladder_of_degree(j, width).reshape(2, -1)
         n = np.arange(-j + 1, j)
         growth = np.sqrt(2.0 * j * (2.0 * j - 1.0) / ((j + n) * (j - n)))
         edge[j, n + width // 2] = growth
-    return DegreeTables(
-        degree_limit, start, recursion.astype(dtype), edge.astype(dtype), ladder.astype(dtype)
-    )
+    aligned = (_on_cache_lines(table.astype(dtype)) for table in (recursion, edge, ladder))
+    return DegreeTables(degree_limit, start, *aligned)
+
+
+def _on_cache_lines(array: NDArray[np.floating]) -> NDArray[np.floating]:
+    """A copy that begins where a cache line does."""
+    line = LINE * 4
+    room = np.zeros(array.nbytes + line, np.uint8)
+    first = -room.ctypes.data % line
+    out = room[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+    out[...] = array
+    return out
 
 
 def row_width(degree_limit: int) -> int:
@@ -194,10 +206,10 @@ def row_width(degree_limit: int) -> int:
 
     Examples
     --------
-    >>> row_width(3)
-    9
+    >>> row_width(8), row_width(9)
+    (16, 32)
     """
-    return 2 * degree_limit - 1 + 2 * ROW_MARGIN
+    return -(-2 * degree_limit // LINE) * LINE
 
 
 def _recursion_of_degree(j: int, width: int) -> NDArray[np.float64]:
@@ -221,15 +233,11 @@ def _recursion_of_degree(j: int, width: int) -> NDArray[np.float64]:
 
 
 def _ladder_of_degree(j: int, width: int) -> NDArray[np.float64]:
-    """(5, j + 1, width) generator elements of degree j, the same for every row."""
+    """(2, j + 1, width) orders and generator elements of degree j, the same for every row."""
     n = np.arange(-j, j + 1, dtype=np.float64)
-    up = np.sqrt((j - n) * (j + n + 1))
-    down = np.sqrt((j + n) * (j - n + 1))
-    up2 = up * np.sqrt(np.maximum((j - n - 1) * (j + n + 2), 0.0))
-    down2 = down * np.sqrt(np.maximum((j + n - 1) * (j - n + 2), 0.0))
-    rows = np.stack([n, up, down, up2, down2])
-    out = np.zeros((5, j + 1, width))
-    out[:, :, width // 2 - j : width // 2 + j + 1] = rows[:, None, :]
+    out = np.zeros((2, j + 1, width))
+    columns = slice(width // 2 - j, width // 2 + j + 1)
+    out[:, :, columns] = np.stack([n, np.sqrt((j - n) * (j + n + 1))])[:, None]
     return out
 
 
@@ -250,27 +258,25 @@ def _recur(
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def fill_wigner_d(
-    beta: float,
+    beta: Turn,
     row_start: NDArray[np.int64],
     recursion: NDArray[np.floating],
     edge: NDArray[np.floating],
     d: NDArray[np.floating],
 ) -> None:
     """All d^j_{mn}(beta), m >= 0, into the flat rows of `DegreeTables`; d is zero at first."""
-    width = edge.shape[1]
+    width, first = edge.shape[1], row_start[0]
     centre = width // 2
     one = d.dtype.type(1.0)
-    cosine = d.dtype.type(np.cos(beta))
-    half_sine = d.dtype.type(-0.5 * np.sin(beta))
-    cosine2 = d.dtype.type(np.cos(0.5 * beta) ** 2)
-    sine2 = d.dtype.type(np.sin(0.5 * beta) ** 2)
+    cosine, half_sine = d.dtype.type(beta[0]), d.dtype.type(-0.5 * beta[1])
+    cosine2, sine2 = d.dtype.type(0.5 + 0.5 * beta[0]), d.dtype.type(0.5 - 0.5 * beta[0])
     top, bottom = one, one
-    d[centre] = one
+    d[first + centre] = one
     for j in range(1, row_start.shape[0] - 1):
         start, before, size = row_start[j], row_start[j - 1], j * width
         # Rows m < j, orders |n| < j. Slices let the compiler see that no index is
         # negative, and so use vector instructions.
-        twice = row_start[j - 2] if j > 1 else 0
+        twice = row_start[j - 2] if j > 1 else first
         _recur(
             recursion[0, start : start + size],
             recursion[1, start : start + size],
@@ -290,35 +296,40 @@ def fill_wigner_d(
         row[centre - j] = bottom
         row[centre + j] = top
         sign = one if j % 2 == 0 else -one
-        columns = d[start : start + size].reshape(j, width)
+        entry = start + centre
         for m in range(j):
-            columns[m, centre + j] = sign * row[centre + m]
-            columns[m, centre - j] = row[centre - m]
+            d[entry + j] = sign * row[centre + m]
+            d[entry - j] = row[centre - m]
+            entry += width
             sign = -sign
 
 
 @numba.njit(cache=True, nogil=True)
-def euler_from_matrix(r: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Angles (alpha, beta, gamma), zyz, of one rotation; gamma = 0 where beta is 0 or pi."""
-    sine = np.hypot(r[0, 2], r[1, 2])
-    beta = np.arctan2(sine, r[2, 2])
-    if sine > 1e-14:
-        return np.arctan2(r[1, 2], r[0, 2]), beta, np.arctan2(r[2, 1], -r[2, 0])
-    # At a pole only alpha +- gamma is determined.
-    if r[2, 2] > 0.0:
-        return np.arctan2(r[1, 0], r[0, 0]), beta, 0.0
-    return np.arctan2(-r[1, 0], -r[0, 0]), beta, 0.0
+def _turn(cosine: float, sine: float) -> Turn:
+    length = np.hypot(cosine, sine)
+    return (cosine / length, sine / length) if length > 0.0 else (1.0, 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
-def fill_phases(angle: float, lowest: int, phases: NDArray[np.floating]) -> None:
-    """cos(m * angle) and sin(m * angle), m = -lowest, ..., into the rows of `phases`."""
+def euler_turns(r: NDArray[np.float64]) -> tuple[Turn, Turn, Turn]:
+    """Cosine and sine of alpha, beta, gamma (zyz) of one rotation; gamma = 0 at the poles."""
+    sine = np.hypot(r[0, 2], r[1, 2])
+    beta = _turn(r[2, 2], sine)
+    if sine > 1e-14:
+        return _turn(r[0, 2], r[1, 2]), beta, _turn(-r[2, 0], r[2, 1])
+    # At a pole only alpha +- gamma is determined.
+    up = 1.0 if r[2, 2] > 0.0 else -1.0
+    return _turn(up * r[0, 0], up * r[1, 0]), beta, (1.0, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_phases(turn: Turn, phases: NDArray[np.floating]) -> None:
+    """cos(m * angle) and sin(m * angle), m = 0, 1, ..., into the rows of `phases`."""
     # By multiplication: rounding of float64 grows with the order, far below float32's.
-    turn_re, turn_im = np.cos(angle), np.sin(angle)
-    re, im = np.cos(lowest * angle), -np.sin(lowest * angle)
+    re, im = 1.0, 0.0
     for k in range(phases.shape[1]):
         phases[0, k], phases[1, k] = re, im
-        re, im = re * turn_re - im * turn_im, re * turn_im + im * turn_re
+        re, im = re * turn[0] - im * turn[1], re * turn[1] + im * turn[0]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -361,14 +372,14 @@ def _real_blocks(
     edge: NDArray[np.floating],
     out: NDArray[np.floating],
 ) -> None:
-    d = np.zeros(row_start[-1], recursion.dtype)
+    d = np.zeros(recursion.shape[1], recursion.dtype)
     left = np.zeros((2, row_start.shape[0] - 1), recursion.dtype)
     right = np.zeros((2, row_start.shape[0] - 1), recursion.dtype)
     for i in range(rotations.shape[0]):
-        alpha, beta, gamma = euler_from_matrix(rotations[i])
+        alpha, beta, gamma = euler_turns(rotations[i])
         fill_wigner_d(beta, row_start, recursion, edge, d)
-        fill_phases(alpha, 0, left)
-        fill_phases(gamma, 0, right)
+        fill_phases(alpha, left)
+        fill_phases(gamma, right)
         offset = 0
         for j in range(row_start.shape[0] - 1):
             size = 2 * j + 1

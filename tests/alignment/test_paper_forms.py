@@ -67,13 +67,17 @@ def test_highest_of_the_grid_is_found_over_all_its_parts(abrdfs, grid, paper_for
 
 
 def test_exact_series_has_its_maximum_where_the_direct_sum_has(
-    abrdfs, grid, paper_forms, monkeypatch
+    abrdfs, grid, paper_forms, monkeypatch, rounding
 ):
     monkeypatch.setattr(paper_forms, "SERIES_AT_ONCE", 100)
     source = couple(abrdfs.astype(np.float32))
     found = paper_forms.exact_maxima(source, source[1:], grid)
-    sums = [paper_forms.direct_abrdf_correlations(one, abrdfs[1], grid) for one in abrdfs]
-    assert np.array_equal(found, [values.argmax() for values in sums])
+    for one, index in zip(abrdfs, found, strict=True):
+        values = paper_forms.direct_abrdf_correlations(one, abrdfs[1], grid)
+        # Of a function with itself R and its transpose give the same: rounding decides.
+        bound = rounding(np.float32, L**4, scale=np.linalg.norm(one) ** 2)
+        assert values[index] > values.max() - bound
+        assert values[index] > np.sort(values)[-4]
 
 
 @pytest.mark.reference

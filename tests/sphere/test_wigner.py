@@ -38,9 +38,11 @@ def test_loss_of_orthogonality_grows_at_most_linearly_with_the_degree():
 
 def test_kernel_and_matrix_form_agree(rounding):
     tables = degree_tables(15, "float64")
-    d = np.zeros(tables.row_start[-1])
+    d = np.zeros(tables.recursion.shape[1])
     for beta in (0.0, 0.7, np.pi):
-        fill_wigner_d(beta, tables.row_start, tables.recursion, tables.edge, d)
+        fill_wigner_d(
+            (np.cos(beta), np.sin(beta)), tables.row_start, tables.recursion, tables.edge, d
+        )
         for j in range(15):
             rows = d[tables.row_start[j] : tables.row_start[j + 1]].reshape(j + 1, -1)
             centre = rows.shape[1] // 2
