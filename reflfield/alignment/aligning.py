@@ -371,8 +371,6 @@ def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit, aims: _Aims) -> _
             )
             state = Materials(targets, frames, data.brightness(), chosen.cluster)
     turned = np.array([_turn_cluster(task, view, state, aims, k) for k in range(n_clusters)])
-    for _ in range(options.rounds if turned.any() else 0):
-        state = one_round(data, state, options, task.n_threads)
     rotations = np.ascontiguousarray(np.swapaxes(state.frames, 1, 2))
     better = SearchResult(rotations, score, np.zeros(len(score)), state.cluster)
     weights = np.where(data.brightness() > 0, np.maximum(score, 0.0), 0.0)
@@ -439,7 +437,11 @@ def _turn_cluster(
         state.brightness[mine],
         np.zeros(len(mine), np.int32),
     )
-    found, known = find_turns(view.data.part(mine), own, view.options, task.n_threads)
+    data, options = view.data.part(mine), view.options
+    found, known = find_turns(data, own, options, task.n_threads)
+    # Only its own target is fitted anew: with more steps others would follow their noise.
+    for _ in range(options.rounds if known else 0):
+        found = one_round(data, found, options, task.n_threads)
     t.values[k] = found.targets.values[0]
     state.frames[mine], state.brightness[mine] = found.frames, found.brightness
     return known

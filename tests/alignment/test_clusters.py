@@ -72,15 +72,34 @@ def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene,
         assert errors[mine].mean() < 1.2 * apart.mean() + 0.05
 
 
+def mixed_relief(scene, materials, n):
+    """Texels of the paper's relief, of materials at random: as `mixture`."""
+    rng, every, d = np.random.default_rng(4), scene.relief_frames(), scene.dome_directions()
+    frames = every[np.sort(rng.choice(len(every), n, replace=False))]
+    label = rng.integers(0, len(materials), n)
+    samples = np.zeros((n, len(d), len(d)), np.float32)
+    for k, material in enumerate(materials):
+        samples[label == k] = scene.sample_texels(frames[label == k], d, d, **material)
+    return frames, d, samples, label
+
+
+@pytest.mark.slow
+def test_a_material_whose_turns_the_samples_tell_leaves_the_other_as_it_is(scene):
+    frames, d, samples, label = mixed_relief(scene, (SIMILAR[0], FAR_APART[1]), 240)
+    found = align(samples, d, d, n_clusters=2, n_threads=2)
+    assert agreement(found.cluster, label) == 1.0
+    first = label == 0
+    alone = align(samples[first], d, d, n_threads=2)
+    apart = scene.frame_errors(alone.local_from_base, frames[first])[0]
+    # Its target once took the steps of the other's too, and followed its noise.
+    errors = scene.frame_errors(found.local_from_base[first], frames[first])[0]
+    assert errors.mean() < 1.05 * apart.mean()
+
+
 def test_few_texels_of_a_shiny_and_a_dull_material_are_told_apart(scene):
     # Of these, targets fitted to a third of the views took 64 % to the right material: with so
     # few texels, those views say nothing of the others.
-    rng, every, d = np.random.default_rng(4), scene.relief_frames(), scene.dome_directions()
-    frames = every[np.sort(rng.choice(len(every), 100, replace=False))]
-    label = rng.integers(0, 2, len(frames))
-    samples = np.zeros((len(frames), len(d), len(d)), np.float32)
-    for k, material in enumerate(SHINY_AND_DULL):
-        samples[label == k] = scene.sample_texels(frames[label == k], d, d, **material)
+    frames, d, samples, label = mixed_relief(scene, SHINY_AND_DULL, 100)
     found = align(samples, d, d, n_clusters=2, n_threads=2)
     assert agreement(found.cluster, label) == 1.0
     assert scene.frame_errors(found.local_from_base, frames)[0].mean() < 0.2
