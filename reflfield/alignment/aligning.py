@@ -371,6 +371,9 @@ def _sharpen(task: _Task, view: _RefiningView, fit: TargetFit, aims: _Aims) -> _
             )
             state = Materials(targets, frames, data.brightness(), chosen.cluster)
     turned = np.array([_turn_cluster(task, view, state, aims, k) for k in range(n_clusters)])
+    if turned.any():
+        # Frames half way to their turns lean: the gauge is that of frames as all will end.
+        state = _settled(task, data, state, turned, options)
     rotations = np.ascontiguousarray(np.swapaxes(state.frames, 1, 2))
     better = SearchResult(rotations, score, np.zeros(len(score)), state.cluster)
     weights = np.where(data.brightness() > 0, np.maximum(score, 0.0), 0.0)
@@ -585,13 +588,7 @@ def _refine_block(
     frames = np.ascontiguousarray(np.swapaxes(found.rotations[part], 1, 2))
     before = found.cluster[part]
     state = Materials(sharp.targets, frames, data.brightness(), before)
-    state = choose(
-        data,
-        _turned(task, data, state, sharp),
-        sharp.options,
-        sharp.options.last_steps,
-        task.n_threads,
-    )
+    state = _settled(task, data, state, sharp.turned, sharp.options)
     found.cluster[part] = state.cluster
     turns = sharp.regauged.turns[state.cluster]
     found.rotations[part] = np.swapaxes(state.frames, 1, 2) @ turns
@@ -608,20 +605,25 @@ def _refine_block(
         )
 
 
-def _turned(task: _Task, data: SampleSet, state: Materials, sharp: _Sharp) -> Materials:
-    """State with the best turns of texels whose cluster's are found on the samples.
+def _settled(
+    task: _Task,
+    data: SampleSet,
+    state: Materials,
+    turned: NDArray[np.bool_],
+    options: RefinementOptions,
+) -> Materials:
+    """Frames against finished targets, after the best turns where these tell (`turned`).
 
     Normals that are some degrees off hide the right turn, so both are found in turn.
     """
-    turned = np.flatnonzero(sharp.turned[state.cluster])
-    if len(turned) == 0:
-        return state
-    few, own, options = data.part(turned), state.part(turned), sharp.options
-    for _ in range(TURN_PASSES):
-        own = best_turns(few, own, options.floor, task.n_threads)
-        own = choose(few, own, options, options.steps, task.n_threads)
-    state.frames[turned], state.brightness[turned] = own.frames, own.brightness
-    return state
+    rows = np.flatnonzero(turned[state.cluster])
+    if len(rows) > 0:
+        few, own = data.part(rows), state.part(rows)
+        for _ in range(TURN_PASSES):
+            own = best_turns(few, own, options.floor, task.n_threads)
+            own = choose(few, own, options, options.steps, task.n_threads)
+        state.frames[rows], state.brightness[rows] = own.frames, own.brightness
+    return choose(data, state, options, options.last_steps, task.n_threads)
 
 
 def _fold_all(

@@ -28,14 +28,15 @@ class Recombination:
     ----------
     row_start : (n_rows + 1,) int64
         First entry of each row.
-    columns : (n_entries,) uint32
+    columns : (n_entries,) uint16
+        Of 65,536 at most, which two band limits of 16 have.
     values : (n_entries,) float
     part_start : (n_parts + 1,) int64
         First row of each part.
     """
 
     row_start: NDArray[np.int64]
-    columns: NDArray[np.uint32]
+    columns: NDArray[np.uint16]
     values: NDArray[np.floating]
     part_start: NDArray[np.int64]
 
@@ -71,13 +72,13 @@ def recombination(matrix: csr_array, parts: list[int], dtype: str) -> Recombinat
     """
     return Recombination(
         matrix.indptr.astype(np.int64),
-        matrix.indices.astype(np.uint32),
+        matrix.indices.astype(np.uint16),
         matrix.data.astype(dtype),
         np.cumsum([0, *parts]),
     )
 
 
-Entries = tuple[NDArray[np.int64], NDArray[np.uint32], NDArray[np.floating]]
+Entries = tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.floating]]
 
 
 @numba.njit(cache=True, nogil=True)
