@@ -229,27 +229,15 @@ def _cosine_between(a: NDArray[np.float64], b: NDArray[np.float64], half_turn: b
 
 @numba.njit(cache=True, nogil=True)
 def _next_hopeful(
-    hopes: NDArray[np.float64],
-    done: NDArray[np.bool_],
-    levels: tuple[float, float, float],
-    found: float,
+    hopes: NDArray[np.float64], done: NDArray[np.bool_], mean: float, best: float
 ) -> int:
-    """Most promising candidate not yet done, -1 if none may still rise above `found`."""
-    mean, top, rise = levels
+    """Most promising candidate not yet done, -1 if none comes near the best."""
     choice = -1
     for c in range(hopes.shape[0]):
         if not done[c] and (choice < 0 or hopes[c] > hopes[choice]):
             choice = c
-    if choice < 0 or not np.any(done):
-        return choice
-    near = hopes[choice] - mean >= HOPEFUL * (top - mean)
-    return choice if near and hopes[choice] + rise > _hoped(found, mean) else -1
-
-
-@numba.njit(cache=True, nogil=True)
-def _hoped(found: float, mean: float) -> float:
-    """What beats `found`: a peak equal but for rounding, as symmetry makes them, does not."""
-    return found + EQUAL_SHARE * (found - mean)
+    hopeful = choice >= 0 and hopes[choice] - mean >= HOPEFUL * (best - mean)
+    return choice if hopeful or not np.any(done) else -1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -350,7 +338,7 @@ def _approach(
 @numba.njit(cache=True, nogil=True, inline="always")
 def _climb_hopeful(
     on: Climbed,
-    levels: tuple[float, float, float],
+    levels: tuple[float, float],
     lowest_z: float,
     symmetric: bool,
     mine: NDArray[np.float64],
@@ -360,19 +348,19 @@ def _climb_hopeful(
 ) -> None:
     """Climb candidates, from the most promising on, while they may still be the best.
 
-    `levels`: the mean of the series, the highest value of the approach, and the most that
-    the degrees which that leaves out can add to any.
+    `levels`: the mean of the series, and the highest value so far.
     """
     re, im, tables, scratch = on
-    mean = levels[0]
+    mean, top = levels
     hopes, done, at = values.copy(), np.zeros(len(mine), np.bool_), np.zeros(11)
     found[0] = -np.inf
     while True:
-        c = _next_hopeful(hopes, done, levels, found[0])
+        c = _next_hopeful(hopes, done, mean, top)
         if c < 0:
             break
         if not _already_there(mine, done, values, c, symmetric):
-            hoped = _hoped(found[0], mean)
+            # A peak that is equal but for rounding, as symmetry makes them, is no better.
+            hoped = found[0] + EQUAL_SHARE * (found[0] - mean)
             limits = (CLIMBING_STEPS, CONVERGED_STEP, lowest_z, hoped)
             ascend(mine[c], re, im, tables, scratch, limits, at)
             values[c] = at[0]
@@ -412,7 +400,6 @@ def climb_best(
     rows: NDArray[np.int64],
     first: NDArray[np.int64],
     rotations: NDArray[np.float64],
-    rises: NDArray[np.float64],
     lowest_z: float,
     half_turns: tuple[bool, bool],
     low: DegreeArrays,
@@ -427,9 +414,6 @@ def climb_best(
     approached with the low degrees; then, from the most promising on, climbed with
     all degrees while they may still be the best. `best` (k, 3, 3) receives the rotations,
     `found` (k, 11) their derivatives, and `rival` (k,) the highest value that ended elsewhere.
-
-    `rises` (k,): the most that the degrees beyond the low ones can add; infinite, if the
-    rivals are to be known as well as that.
 
     `half_turns`: whether rotations that differ by a half turn about z count as one in
     `rival`; and whether the series hardly change with it: of two such candidates only one is
@@ -448,7 +432,7 @@ def climb_best(
         complex_spectrum(series[rows[i]], low[0], re_low, im_low)
         top = _approach(on_low, mean, lowest_z, symmetric, mine, values)
         complex_spectrum(series[rows[i]], full[0], re, im)
-        levels = (mean, top, rises[i])
+        levels = (mean, top)
         _climb_hopeful(on, levels, lowest_z, symmetric, mine, values, best[i], found[i])
         if symmetric:
             _look_at_other_side(on, lowest_z, mine, values, best[i], found[i])

@@ -222,8 +222,7 @@ def _search_block(
     source: Coupled, start: NDArray[np.float64] | None, plan: _Plan
 ) -> SearchResult:
     """Search of a few functions against all (unit) targets."""
-    parts = source.degree_norms()
-    norms = np.linalg.norm(parts, axis=1)
+    norms = source.norms()
     inverse = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
     # Unit series, so that the float32 kernels never meet 1e-12 or 1e12.
     series = [spectrum(source, target, inverse) for target in plan.targets]
@@ -239,18 +238,12 @@ def _search_block(
     for k in range(len(plan.targets)):
         final = np.flatnonzero(rank[k] < N_FINALISTS)
         candidates = _candidates(coarse[k][0], final, start)
-        rise = inverse * _rise(parts, plan.targets[k])
-        _keep_better(best, series[k], rise, candidates, k, plan)
+        _keep_better(best, series[k], candidates, k, plan)
     nothing = ~(norms > 0) | ~np.isfinite(best.score)
     best.score[nothing] = 0.0
     best.margin[nothing] = 0.0
     best.rotations[nothing] = np.eye(3)
     return best
-
-
-def _rise(norms: NDArray[np.float64], target: Coupled) -> NDArray[np.float64]:
-    r"""Most that degrees beyond those of the approach add: :math:`\sum_j \|A_j\| \|B_j\|`."""
-    return norms[:, APPROACH_DEGREES:] @ target.degree_norms()[0, APPROACH_DEGREES:]
 
 
 def _candidates(
@@ -270,28 +263,22 @@ def _candidates(
 def _keep_better(
     best: SearchResult,
     series: NDArray[np.floating],
-    rise: NDArray[np.float64],
     candidates: _Candidates,
     k: int,
     plan: _Plan,
 ) -> None:
-    """Update `best` in place with target k for the functions that have candidates.
-
-    `rise` (n,) is the most that the degrees beyond those of the approach can add.
-    """
+    """Update `best` in place with target k for the functions that have candidates."""
     who = candidates.rows
     if len(who) == 0:
         return
     n_degrees, dtype = degrees_of(series), str(series.dtype)
     top, at_top = np.zeros((len(who), 3, 3)), np.zeros((len(who), 11))
     rival = np.zeros(len(who))
-    rises = np.full(len(who), np.inf) if plan.margins else rise[who]
     climb_best(
         series,
         who,
         candidates.first,
         candidates.rotations,
-        rises,
         lowest_z_of(plan.max_tilt),
         (bool(plan.half_turns) and plan.half_turns[k], plan.symmetric[k]),
         degree_arrays(min(n_degrees, APPROACH_DEGREES), dtype),

@@ -156,13 +156,13 @@ def real_coupling(l1: int, l2: int) -> NDArray[np.float64]:
 
 # Reordering of sums only.
 @numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def _sum_squares(rows: NDArray[np.floating], out: NDArray[np.float64]) -> None:
-    """Sum of squares of each row, in double precision."""
+def _add_squares(rows: NDArray[np.floating], out: NDArray[np.float64]) -> None:
+    """Add the sum of squares of each row, in double precision."""
     for i in range(rows.shape[0]):
         total = 0.0
         for k in range(rows.shape[1]):
             total += np.float64(rows[i, k]) * np.float64(rows[i, k])
-        out[i] = total
+        out[i] += total
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,14 +204,10 @@ class Coupled:
 
     def norms(self) -> NDArray[np.float64]:
         """(n,) root of the sum of squares, the function's L2 norm."""
-        return np.linalg.norm(self.degree_norms(), axis=1)
-
-    def degree_norms(self) -> NDArray[np.float64]:
-        """(n, n_degrees) norms of the parts of each degree."""
-        out = np.zeros((len(self), self.n_degrees))
-        for j, block in enumerate(self.blocks):
-            _sum_squares(block.reshape(len(self), -1), out[:, j])
-        return np.sqrt(out)
+        total = np.zeros(len(self))
+        for block in self.blocks:
+            _add_squares(block.reshape(len(self), -1), total)
+        return np.sqrt(total)
 
     def units(self) -> Coupled:
         """Each function over its norm; zero functions stay zero."""
