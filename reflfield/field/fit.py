@@ -55,6 +55,9 @@ class SampleFitOptions:
         Standard deviation about each axis that the aligned frames are taken to have: half
         way through the rounds they are improved against the model, held by that much.
         0 keeps them.
+    fineness : float
+        Intervals between nodes in the second half of the rounds over those of the grid of the
+        resampling (`field.fineness`). 1 keeps that grid.
     max_bytes : int
         Samples of the texels that shape the basis are held in memory up to this size;
         coefficients are found for all texels, block by block.
@@ -64,10 +67,11 @@ class SampleFitOptions:
     iterations: int = 12
     smoothness: float = 0.05
     frame_spread_deg: float = 1.0
+    fineness: float = 4 / 3
     max_bytes: int = 192 << 20
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "iterations", "max_bytes"):
+        for name in ("rounds", "iterations", "max_bytes", "fineness"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
         if not self.smoothness >= 0:
@@ -123,14 +127,38 @@ class ClusteredModel:
         return np.moveaxis(parts[..., 1:, :], 3, 1)
 
 
+@numba.njit(cache=True, nogil=True)
+def _touched(nodes: Ints, weights: Floats, found: Ints) -> int:
+    """Number of light nodes that samples of one texel lie between; they are put in `found`."""
+    is_touched = np.zeros(len(found), np.bool_)
+    for j in range(len(nodes)):
+        if weights[j] != 0:
+            for tap in range(4):
+                is_touched[nodes[j, tap]] = True
+    count = 0
+    for node in range(len(found)):
+        if is_touched[node]:
+            found[count] = node
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _clear(plane: Floats, touched: Ints) -> None:
+    for a in touched:
+        for k in range(plane.shape[1]):
+            plane[a, k] = 0
+
+
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _at_view(table: Floats, nodes: Ints, weights: Floats, out: Floats) -> None:
-    out[:] = 0
+def _at_view(table: Floats, nodes: Ints, weights: Floats, touched: Ints, out: Floats) -> None:
+    """Functions of the light alone, at the nodes that matter."""
+    _clear(out, touched)
     for tap in range(4):
         weight = weights[tap]
         if weight != 0:
             plane = table[nodes[tap]]
-            for a in range(out.shape[0]):
+            for a in touched:
                 for k in range(out.shape[1]):
                     out[a, k] += weight * plane[a, k]
 
@@ -221,14 +249,17 @@ def _solve_coefficients(
 ) -> None:
     n_components = precision.shape[1]
     plane = np.zeros(table.shape[2:], np.float32)
+    lit = np.zeros(table.shape[2], np.int32)
     for t in range(len(values)):
+        touched = lit[: _touched(light_nodes[t], light_weights[t], lit)]
         normal = np.zeros((n_components, n_components))
         right = np.zeros(n_components)
         n_values = 0
         for i in np.flatnonzero(view_weights[t]):
             weights = view_weights[t, i] * light_weights[t] * pairs[i]
             n_values += 3 * int(np.count_nonzero(weights))
-            _at_view(table[cluster[t]], view_nodes[t, i], view_taps[t, i], plane)
+            taps = (view_nodes[t, i], view_taps[t, i])
+            _at_view(table[cluster[t]], *taps, touched, plane)
             _add_normal_equations(
                 values[t, i],
                 weights,
@@ -274,11 +305,13 @@ def _spread_view(
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _spread_over_views(spread: Floats, nodes: Ints, weights: Floats, out: Floats) -> None:
+def _spread_over_views(
+    spread: Floats, nodes: Ints, weights: Floats, touched: Ints, out: Floats
+) -> None:
     for tap in range(4):
         if weights[tap] != 0:
             target = out[nodes[tap]]
-            for a in range(target.shape[0]):
+            for a in touched:
                 for k in range(target.shape[1]):
                     target[a, k] += weights[tap] * spread[a, k]
 
@@ -303,13 +336,16 @@ def _accumulate(
     plane = np.zeros(table.shape[2:], np.float32)
     spread = np.zeros(table.shape[2:], np.float32)
     factor = np.ones(table.shape[3] // 3, np.float32)
+    lit = np.zeros(table.shape[2], np.int32)
     for t in range(len(values)):
+        touched = lit[: _touched(light_nodes[t], light_weights[t], lit)]
         factor[1:] = coefficients[t]
         for i in np.flatnonzero(view_weights[t]):
             weights = view_weights[t, i] * light_weights[t] * pairs[i]
-            spread[:] = 0
+            taps = (view_nodes[t, i], view_taps[t, i])
+            _clear(spread, touched)
             if not of_samples:
-                _at_view(table[cluster[t]], view_nodes[t, i], view_taps[t, i], plane)
+                _at_view(table[cluster[t]], *taps, touched, plane)
             _spread_view(
                 values[t, i],
                 weights,
@@ -320,7 +356,7 @@ def _accumulate(
                 of_samples,
                 spread,
             )
-            _spread_over_views(spread, view_nodes[t, i], view_taps[t, i], out[cluster[t]])
+            _spread_over_views(spread, *taps, touched, out[cluster[t]])
 
 
 def _arguments(rooted: RootedSamples, part: slice) -> tuple[NDArray[np.generic], ...]:

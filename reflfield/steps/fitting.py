@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from reflfield.factorization import Completion
 from reflfield.field.compression import CompressionOptions, cluster_completed, fill_unobserved
+from reflfield.field.fineness import finer_sides, on_finer_nodes
 from reflfield.field.fit import (
     ClusteredModel,
     SampleFitOptions,
@@ -154,24 +155,26 @@ def _fitted_to_samples(
     blocks: Blocks,
     name: str = "",
 ) -> tuple[ClusteredModel, TexelReader]:
-    """Fit to the samples, in frames that are improved on the way where they are free."""
+    """Fit to the samples; half way, frames that are free are improved and nodes made finer."""
     options = job.options.compression.samples
-    spread = np.radians(options.frame_spread_deg)
-    parts = options.halves() if len(free) and spread > 0 else (options,)
+    first, second = options.halves()
     model = replace(model, residuals=())
-    for i, part in enumerate(parts):
-        if i > 0:
-            better = blocks.map(
-                f"frames against the model{name}",
-                turned_block,
-                SampleFit(reader, model, spread),
-                reader.blocks_of(free),
-            )
-            frames = reader.local_from_world.copy()
-            frames[free] = better.joined("frames")
-            reader = reader.rotated(frames)
-        model = _fitted_once(job, model, reader, part, blocks, f"{name}, part {i + 1}")
-    return model, reader
+    model = _fitted_once(job, model, reader, first, blocks, f"{name}, part 1")
+    spread = np.radians(options.frame_spread_deg)
+    if len(free) and spread > 0:
+        better = blocks.map(
+            f"frames against the model{name}",
+            turned_block,
+            SampleFit(reader, model, spread),
+            reader.blocks_of(free),
+        )
+        frames = reader.local_from_world.copy()
+        frames[free] = better.joined("frames")
+        reader = reader.rotated(frames)
+    n_functions = len(model.table) * (model.coefficients.shape[1] + 1)
+    sides = finer_sides(reader.sides, n_functions, options.fineness)
+    model, reader = on_finer_nodes(model, sides), replace(reader, sides=sides)
+    return _fitted_once(job, model, reader, second, blocks, f"{name}, part 2"), reader
 
 
 def _fitted_once(
