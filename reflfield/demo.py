@@ -29,7 +29,7 @@ SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
 # The demo has to end within three minutes on two cores, compilation included: texels a little
 # coarser than usual, bases shaped by half as many, frames of the harmonic search, the fit that
-# trials would take, and a second field for the comparison.
+# trials would take with half of its rounds, and a second field for the comparison.
 TRAINING_TEXELS = 4096
 OPTIONS = PipelineOptions(
     texture=TextureOptions(texels_per_pixel=1.1),
@@ -38,7 +38,7 @@ OPTIONS = PipelineOptions(
     compression=CompressionOptions(
         fit="samples",
         training_texels=TRAINING_TEXELS,
-        samples=SampleFitOptions(frame_spread_deg=0.0),
+        samples=SampleFitOptions(rounds=2, frame_spread_deg=0.0),
     ),
     comparison=ComparisonOptions(without_alignment=True),
 )
