@@ -72,7 +72,7 @@ class SampleFitOptions:
 
     def __post_init__(self) -> None:
         for name in ("rounds", "iterations", "max_bytes", "fineness"):
-            if getattr(self, name) < 1:
+            if not 1 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
         if not self.smoothness >= 0:
             raise InputError(f"smoothness: expected >= 0, received {self.smoothness}")

@@ -141,8 +141,9 @@ class DegreeTables:
     Only rows m >= 0 are kept: those of negative order follow by symmetry. The
     row of (j, m) begins at ``row_start[j] + m * width``, and order n stands ``width // 2 + n``
     farther, for all degrees alike: so loops run over whole degrees, and rows are whole cache
-    lines. What no order -j .. j fills is zero. A line of zeros stands before the first row
-    and after the last, so that orders n - 2 .. n + 2 can be read without a test.
+    lines. What no order -j .. j fills is zero. Orders n - 2 .. n + 2 can be read without a
+    test: what is read of the next row meets a zero of the ladder, and a line of zeros stands
+    before the first row and after the last.
 
     Parameters
     ----------

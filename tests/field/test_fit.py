@@ -478,6 +478,8 @@ class TestFit:
     [
         ({"rounds": 0}, "rounds: expected at least 1, received 0"),
         ({"iterations": 0}, "iterations: expected at least 1"),
+        ({"fineness": 0.5}, "fineness: expected at least 1, received 0.5"),
+        ({"fineness": float("nan")}, "fineness: expected at least 1, received nan"),
         ({"smoothness": -1.0}, "smoothness: expected >= 0"),
         ({"smoothness": float("nan")}, "smoothness: expected >= 0"),
     ],
