@@ -28,8 +28,8 @@ from reflfield.steps.options import (
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
 # The demo has to end within three minutes on two cores, compilation included: texels a little
-# coarser than usual, bases shaped by half as many, frames of the harmonic search, the fit that
-# trials would take with half of its rounds, and a second field for the comparison.
+# coarser than usual, bases shaped by half as many, frames of the harmonic search, the fit
+# that trials would take with a third of its steps, and a second field for the comparison.
 TRAINING_TEXELS = 4096
 OPTIONS = PipelineOptions(
     texture=TextureOptions(texels_per_pixel=1.1),
@@ -38,20 +38,39 @@ OPTIONS = PipelineOptions(
     compression=CompressionOptions(
         fit="samples",
         training_texels=TRAINING_TEXELS,
-        samples=SampleFitOptions(rounds=2, frame_spread_deg=0.0),
+        samples=SampleFitOptions(rounds=2, iterations=8, frame_spread_deg=0.0),
     ),
     comparison=ComparisonOptions(without_alignment=True),
 )
 
 
-# The smallest alignment that calls all that the demo's does.
-COMPILE_ALIGNMENT = """
+# The smallest alignment and the smallest fit to samples that call all that the demo's do.
+COMPILE = """
 import numpy as np
 from reflfield.alignment import align
+from reflfield.field.fit import ClusteredModel, SampleFitOptions, fit_samples
+from reflfield.observations.resampling import TexelSamples, rooted_samples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 directions = HemisphereGrid(7).directions
 align(np.ones((2, 49, 49), np.float32), directions, directions, 4, refine=False)
+few = np.tile(directions[:5].astype(np.float32), (2, 1, 1))
+seen, pairs = np.ones((2, 5), bool), np.ones((5, 5), bool)
+texels = TexelSamples(np.ones((2, 5, 5, 3), np.float32), few, few, seen, seen, pairs)
+frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
+model = ClusteredModel(
+    np.zeros(2, np.int32),
+    np.zeros((2, 1), np.float32),
+    np.ones((1, 9, 9, 6), np.float32),
+    np.ones((1, 1, 1)),
+)
+fit_samples(
+    lambda some: rooted_samples(texels, frames, (3, 3), "cube_root"),
+    model,
+    np.arange(2),
+    1000,
+    SampleFitOptions(rounds=1),
+)
 """
 
 
@@ -88,13 +107,13 @@ def run_demo(out: Path, workers: int) -> Job:
 
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
-    """Compile what the alignment needs in a process of its own, beside the first stages.
+    """Compile what alignment and fit need in a process of its own, beside the first stages.
 
     Numba keeps it on disk, where the run finds it: a third of the compilation on a fresh
     machine. Compiled before, it takes two seconds; if it fails, the run compiles for itself.
     """
     process = subprocess.Popen(
-        [sys.executable, "-c", COMPILE_ALIGNMENT],
+        [sys.executable, "-c", COMPILE],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
