@@ -1,21 +1,210 @@
-"""Files that are written whole or not at all."""
+"""Files that are read whole after a look at what they are, and written whole or not at all.
+
+Input files are not trusted: only regular files are opened (a FIFO would wait for ever, a device
+never end), sizes are compared with a limit before memory is taken, and nothing is unpickled.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.errors import InputError
+
+# What a file that is no regular one is called in messages.
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+# Characters of the header of one array in an npz file, which numpy evaluates as a literal.
+LONGEST_ARRAY_HEADER = 10_000
+# File systems without fsync of folders or of files opened for reading say one of these.
+_NO_FSYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.ENOSYS)
+
+
+def check_regular(path: Path, error: type[InputError] = InputError) -> int:
+    """Demand a regular file, before it is opened; return its size in bytes.
+
+    Parameters
+    ----------
+    path : Path
+        Symbolic links are followed.
+    error : type, optional
+        What to raise.
+
+    Raises
+    ------
+    InputError
+        Of the type asked for, if the file is missing or a folder, pipe, device or socket.
+    """
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as failure:
+        reason = getattr(failure, "strerror", None) or failure
+        raise error(f"{path}: cannot be read ({reason})") from failure
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((name for test, name in _KINDS if test(found.st_mode)), "something else")
+        raise error(f"{path}: expected a file, received {kind}; name the file itself")
+    return found.st_size
+
+
+def read_bytes(path: Path, most_bytes: int, error: type[InputError] = InputError) -> bytes:
+    """Bytes of a regular file of a bounded size.
+
+    Parameters
+    ----------
+    path : Path
+    most_bytes : int
+        A larger file is refused unread.
+    error : type, optional
+        What to raise.
+
+    Raises
+    ------
+    InputError
+        Of the type asked for, naming the file.
+    """
+    size = check_regular(path, error)
+    if size > most_bytes:
+        raise error(
+            f"{path}: expected at most {most_bytes:,} bytes, received {size:,}; "
+            "is this the right file?"
+        )
+    try:
+        with path.open("rb") as file:
+            content = file.read(most_bytes + 1)
+    except OSError as failure:
+        raise error(f"{path}: cannot be read ({failure.strerror or failure})") from failure
+    if len(content) > most_bytes:
+        raise error(f"{path}: expected at most {most_bytes:,} bytes, but the file grows")
+    return content
+
+
+def load_arrays(
+    path: Path, most_bytes: int, error: type[InputError] = InputError
+) -> dict[str, NDArray[Any]]:
+    """Arrays of an npz file, whose sizes are looked at before memory is taken.
+
+    Parameters
+    ----------
+    path : Path
+    most_bytes : int
+        Of all arrays together, unpacked.
+    error : type, optional
+        What to raise.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Numbers, booleans or fixed-length text; never Python objects.
+
+    Raises
+    ------
+    InputError
+        Of the type asked for, naming the file, if it is no npz file, damaged, too large or
+        holds pickled objects.
+    """
+    check_regular(path, error)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+            size = sum(member.file_size for member in members)
+            if size > most_bytes:
+                raise error(
+                    f"{path}: expected arrays of at most {most_bytes:,} bytes, received "
+                    f"{size:,}; is this the right file?"
+                )
+            return {
+                member.filename.removesuffix(".npy"): _read_member(archive, member)
+                for member in members
+            }
+    except error:
+        raise
+    # What zipfile and numpy raise on damaged files; zlib.error is none of the others.
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, NotImplementedError,
+            SyntaxError, TypeError, MemoryError, OverflowError, zipfile.BadZipFile,
+            zipfile.LargeZipFile, zlib.error) as failure:  # fmt: skip
+        text = " ".join(str(failure).split()) or type(failure).__name__
+        raise error(
+            f"{path}: expected arrays in an npz file, received a damaged, truncated or "
+            f"different file ({text}); copy or make it again"
+        ) from failure
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array, whose header must agree with the size of the member."""
+    with archive.open(member) as file:
+        shape, dtype = _array_header(file)
+        claimed = dtype.itemsize
+        for length in shape:
+            claimed *= length
+        if claimed > member.file_size:
+            raise ValueError(f"{member.filename} claims {claimed:,} bytes that are not there")
+    with archive.open(member) as file:
+        array: NDArray[Any] = np.lib.format.read_array(
+            file, allow_pickle=False, max_header_size=LONGEST_ARRAY_HEADER
+        )
+        if file.read(1):  # which also compares the checksum
+            raise ValueError(f"{member.filename} goes on after its array")
+    return array
+
+
+def _array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type that an npy file claims."""
+    version = np.lib.format.read_magic(file)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
+    if read is None:
+        raise ValueError(f"version {version} of the npy format")
+    shape, _, dtype = read(file, max_header_size=LONGEST_ARRAY_HEADER)
+    if dtype.hasobject:
+        raise ValueError("pickled objects, which are never read")
+    return shape, dtype
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary name that becomes `path` if the block succeeds, else vanishes.
 
-    The name is always the same, so that what a killed run left of it is written over.
+    The name is always the same, so that what a killed run left of it is written over. The
+    content is on the disk before the name is given: after a power failure `path` holds the
+    earlier file or the new one.
     """
     partial = path.with_name(f".{path.name}.partial")
     try:
         yield partial
+        flush_to_disk(partial)
         partial.replace(path)
+        flush_to_disk(path.parent)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def flush_to_disk(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:  # folders cannot be opened on Windows
+        return
+    try:
+        os.fsync(handle)
+    except OSError as failure:
+        if failure.errno not in _NO_FSYNC:
+            raise
+    finally:
+        os.close(handle)
