@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 from PIL.Image import Image
 
+from reflfield.capture.clipping import measured_values
 from reflfield.errors import CaptureError, InputError, ShapeError
 
 Float32 = NDArray[np.float32]
@@ -96,6 +97,37 @@ def read_image(path: Path | str) -> Float32:
     image = _exr_rgb(path) if _is_exr(path) else _decoded(path)
     _check_finite(path, image)
     return image
+
+
+def read_measured(
+    path: Path | str, white_level: float | None = None
+) -> tuple[Float32, NDArray[np.bool_]]:
+    """Read an image as linear RGB, and which of its values are neither too bright nor too dark.
+
+    Parameters
+    ----------
+    path : Path or str
+        As `read_image`.
+    white_level : float, optional
+        Stored value from which on the sensor is saturated (`capture.clipping`).
+
+    Returns
+    -------
+    image : (h, w, 3) float32
+    measured : (h, w, 3) bool
+    """
+    path = Path(path)
+    if _is_exr(path):
+        image = read_image(path)
+        return image, measured_values(image, integer=False, white_level=white_level)
+    encoded = read_encoded(path)
+    colour = _three_channels(encoded)
+    measured = measured_values(colour, integer=True, white_level=white_level)
+    if encoded.shape[2] in (2, 4):
+        measured &= encoded[..., -1:] > 0
+    image = decode_srgb(colour).astype(np.float32)
+    _check_finite(path, image)
+    return image, measured
 
 
 def read_encoded(path: Path | str) -> Float32:
@@ -222,6 +254,14 @@ def merge_exposures(encoded: Sequence[Float32], seconds: Sequence[float]) -> Flo
     )
     weighted = total / np.where(time > 0, time, 1)
     return np.where(time > 0, weighted, fallback).astype(np.float32)
+
+
+def measured_exposures(encoded: Sequence[Float32]) -> NDArray[np.bool_]:
+    """True where at least one of several bracketed exposures measures, (h, w, 3)."""
+    measured = np.zeros(encoded[0].shape, dtype=bool)
+    for image in encoded:
+        measured |= measured_values(image, integer=True)
+    return measured
 
 
 def write_exr(

@@ -15,10 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from reflfield.capture.cameras import Camera
 from reflfield.capture.images import (
     image_size,
+    measured_exposures,
     merge_exposures,
     read_coverage,
     read_exposure,
     read_image,
+    read_measured,
 )
 from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.silhouettes import silhouette_from_photographs
@@ -70,6 +72,15 @@ class Photograph:
             return read_image(self.path) / np.float32(self.exposures[0].seconds)
         images = [read_exposure(e.path) for e in self.exposures]
         return merge_exposures(images, [e.seconds for e in self.exposures])
+
+    def read_measured(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Radiance and which of its values are measurements (`Capture.read_measured`)."""
+        if len(self.exposures) == 1:
+            image, measured = read_measured(self.path)
+            return image / np.float32(self.exposures[0].seconds), measured
+        images = [read_exposure(e.path) for e in self.exposures]
+        seconds = [e.seconds for e in self.exposures]
+        return merge_exposures(images, seconds), measured_exposures(images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +178,36 @@ class Capture:
         camera = self.cameras[photograph.camera]
         _check_matches(photograph.path, camera, image.shape[1], image.shape[0])
         return image
+
+    def read_measured(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Linear radiance of photograph `index`, and where it was measured.
+
+        A saturated or black-clipped value is no measurement, nor is what lies under alpha 0;
+        the rules are in `capture.clipping`. Of bracketed exposures one that measures is
+        enough.
+
+        Parameters
+        ----------
+        index : int
+            Index into `photographs`.
+
+        Returns
+        -------
+        radiance : (h, w, 3) float32
+            As `read_photograph`; finite where nothing was measured, too.
+        measured : (h, w, 3) bool
+            Per channel: True where the value is a measurement.
+
+        Raises
+        ------
+        CaptureError
+            As `read_photograph`.
+        """
+        photograph = self.photographs[index]
+        image, measured = photograph.read_measured()
+        camera = self.cameras[photograph.camera]
+        _check_matches(photograph.path, camera, image.shape[1], image.shape[0])
+        return image, measured
 
     def read_silhouette(self, view: int) -> NDArray[np.float32]:
         """Coverage of view `view` in [0, 1], (h, w) float32.
