@@ -184,9 +184,10 @@ def supported_side(data: SampleSet, n_clusters: int = 1) -> int:
 
 
 def _of_unit_size(data: SampleSet) -> SampleSet:
-    """Samples over the largest of each texel: float32 holds any scale."""
-    size = np.nanmax(np.abs(data.samples), axis=(1, 2), initial=0.0, keepdims=True)
-    samples = data.samples / np.where(size > 0, size, 1)
+    """Samples over the largest of each texel: float32 holds any scale; NaN if not finite."""
+    observed = np.where(np.isfinite(data.samples), data.samples, np.nan)
+    size = np.nanmax(np.abs(observed), axis=(1, 2), initial=0.0, keepdims=True)
+    samples = observed / np.where(size > 0, size, 1)
     return replace(data, samples=samples.astype(np.float32))
 
 

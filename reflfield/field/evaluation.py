@@ -15,9 +15,10 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import check_shape
+from reflfield.checks import UNIT_TOLERANCE, check_shape
 from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField
+from reflfield.field.quantisation import check_finite
 from reflfield.sphere.hemisphere import first_tap, softened_cosine_of, square_from_xyz
 
 # Kernel helpers are typed by numba; to mypy their scalars are Any.
@@ -187,7 +188,7 @@ def evaluate(
     ShapeError
         If the shapes differ.
     InputError
-        If a texel does not exist.
+        If a texel does not exist, or the direction of one that does is no unit vector.
 
     Notes
     -----
@@ -237,7 +238,7 @@ def light_response(
     ShapeError
         If the shapes differ.
     InputError
-        If a texel does not exist.
+        If a texel does not exist, or the direction of one that does is no unit vector.
     """
     index, views = _checked(field, texels, "views_world", views_world)
     out = np.zeros((len(index), field.light_side**2, 3), np.float32)
@@ -291,7 +292,8 @@ def sum_lights(
     ShapeError
         If shapes differ.
     InputError
-        If a texel does not exist.
+        If a texel does not exist, a direction is no unit vector, or an irradiance is not
+        finite.
 
     Notes
     -----
@@ -302,8 +304,10 @@ def sum_lights(
     index, _ = _checked(field, texels, "views_world", views_world)
     lights = np.ascontiguousarray(lights_world, np.float32)
     check_shape("lights_world", lights, (None, 3))
+    _check_unit("lights_world", lights)
     powers = np.ascontiguousarray(irradiances, np.float32)
     check_shape("irradiances", powers, (len(lights), 3))
+    check_finite("irradiances", powers)
     # One row serves all texels when nothing is shadowed.
     reached = np.ones((1, len(lights)), np.bool_) if lit is None else np.ascontiguousarray(lit)
     if lit is not None:
@@ -398,4 +402,21 @@ def _checked(
             f"texels: expected -1 to {field.n_texels - 1}, received "
             f"{int(index.min())} to {int(index.max())}"
         )
+    _check_unit(name, vectors, index >= 0)
     return index, vectors
+
+
+def _check_unit(
+    name: str, vectors: NDArray[np.float32], used: NDArray[np.bool_] | None = None
+) -> None:
+    """Demand unit vectors of the rows that are used; all by default."""
+    squares = np.einsum("nd,nd->n", vectors, vectors)
+    off = ~(np.abs(squares - 1.0) <= 2.0 * UNIT_TOLERANCE)
+    if used is not None:
+        off &= used
+    if off.any():
+        row = int(off.argmax())
+        raise InputError(
+            f"{name}: expected unit vectors, received {vectors[row].tolist()} in row {row}; "
+            "divide each row by its length"
+        )

@@ -197,7 +197,8 @@ class Systems:
         """Sums over the shade of each texel."""
         n, n_lights = shade.weights.shape
         harmonics = real_harmonics(shade.lights.reshape(-1, 3), band_limit)
-        harmonics = harmonics.reshape(n, n_lights, -1)
+        # Not -1: where no texel is in shadow there is nothing to infer it from.
+        harmonics = harmonics.reshape(n, n_lights, n_coefficients(band_limit))
         weighted = harmonics * shade.weights[..., None]
         one = np.swapaxes(weighted, 1, 2) @ harmonics
         size = 3 * one.shape[1]

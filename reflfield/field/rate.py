@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import log2
+from math import inf, log2
+
+import numpy as np
 
 from reflfield.errors import InputError
 from reflfield.field.file import PackedSizes
@@ -17,6 +19,8 @@ WIDEST = 2.0**12
 # A file this share below the size that is asked for is close enough.
 CLOSE = 0.005
 MOST_TRIALS = 14
+# Where a search begins without a residual: this share of the root mean square of the means.
+START_SHARE = 2.0**-10
 
 
 def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
@@ -27,7 +31,8 @@ def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
     build : callable
         From a quantisation step to the field.
     step : float
-        Where the search begins.
+        Where the search begins; 0, of a model without a residual, is replaced by a share of
+        what the field holds.
     size : int
         Bytes of the file, at most.
 
@@ -38,9 +43,10 @@ def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
     Raises
     ------
     InputError
-        If even the coarsest field is larger.
+        If even the coarsest field is larger, or the step is no number.
     """
     sizes = PackedSizes()
+    step = _first_step(build, step)
     bracket = _Bracket(log2(step / WIDEST), log2(step * WIDEST))
     best, at = None, log2(step)
     for _ in range(MOST_TRIALS):
@@ -101,6 +107,16 @@ class _Bracket:
         return self.low + min(max(share, 0.1), 0.9) * self.width
 
 
+def _first_step(build: Build, step: float) -> float:
+    """Step that a search can begin with: a model that fits exactly gives none."""
+    if not 0 <= step < inf:
+        raise InputError(f"step: expected a number >= 0, received {step}")
+    if step > 0:
+        return step
+    size = float(np.sqrt(np.mean(np.square(build(0.0).mean, dtype=np.float64))))
+    return START_SHARE * size or 1.0
+
+
 def field_of_quality(
     build: Build, measure: Callable[[ReflectanceField], float], step: float, least: float
 ) -> ReflectanceField:
@@ -113,14 +129,20 @@ def field_of_quality(
     measure : callable
         Quality of a field; falls as the step grows.
     step : float
-        Where the search begins.
+        Where the search begins; 0 as in `field_of_size`.
     least : float
 
     Returns
     -------
     ReflectanceField
         Within a tenth of the step at which the quality is just reached.
+
+    Raises
+    ------
+    InputError
+        If the step is no number.
     """
+    step = _first_step(build, step)
     finest = build(step / 64.0)
     if measure(finest) < least:
         return finest

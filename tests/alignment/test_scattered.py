@@ -108,6 +108,15 @@ def test_texels_without_samples_keep_their_frames(sparse):
 
 
 @pytest.mark.stability
+def test_infinity_is_unobserved_as_nan_is(sparse):
+    data, start, _ = sparse
+    infinite = np.where(np.isnan(data.samples), np.float32(np.inf), data.samples)
+    infinite[::2] *= np.where(np.isinf(infinite[::2]), -1, 1)
+    signed = SampleSet(infinite, data.views, data.lights)
+    np.testing.assert_array_equal(refined(signed, start), refined(data, start))
+
+
+@pytest.mark.stability
 def test_nothing_observed_at_all_leaves_the_frames(sparse):
     data, start, _ = sparse
     nothing = SampleSet(np.full_like(data.samples, np.nan), data.views, data.lights)

@@ -172,6 +172,27 @@ def test_absent_texels_are_black_and_others_refused(make_field):
         sum_lights(field, [0], up, up, [[1, 1, 1]], np.ones((2, 1), bool))
 
 
+@pytest.mark.parametrize("bad", [[np.nan, 0, 1], [0, 0, 2], [0, 0, 0], [np.inf, 0, 0]])
+def test_directions_that_are_no_unit_vectors_are_refused(bad, make_field):
+    field, up = make_field(), [[0, 0, 1.0]]
+    with pytest.raises(InputError, match=r"views_world: expected unit vectors, .* in row 0"):
+        evaluate(field, [0], [bad], up)
+    with pytest.raises(InputError, match=r"lights_world: expected unit vectors, .* in row 1"):
+        evaluate(field, [0, 1], up * 2, [*up, bad])
+    with pytest.raises(InputError, match="views_world: expected unit vectors"):
+        light_response(field, [0], [bad])
+    with pytest.raises(InputError, match="lights_world: expected unit vectors"):
+        sum_lights(field, [0], up, [bad], [[1, 1, 1]])
+    # Of no texel, nothing is asked.
+    assert not evaluate(field, [-1], [bad], up).any()
+
+
+def test_irradiance_that_is_not_finite_is_refused(make_field):
+    up = [[0, 0, 1.0]]
+    with pytest.raises(InputError, match="irradiances: expected finite"):
+        sum_lights(make_field(), [0], up, up, [[1, np.inf, 1]])
+
+
 def test_taps_interpolate_texel_coordinates(rng):
     field = baked_field(square_surface(8), lambert(0.5))
     inside = (0.5 + 7 * rng.random((200, 2))) / 8

@@ -117,6 +117,18 @@ def test_no_shade_no_energy_and_one_texel_are_defined(rng):
 
 
 @pytest.mark.stability
+def test_object_without_a_texel_in_shadow_has_black_indirect_light(rng):
+    """As under a flash beside the camera: what it does not reach is not seen either."""
+    _, shade = planted(rng, n_texels=4)
+    model = fit_indirect(
+        lambda texels: some(shade, texels), np.zeros(0, np.intp), N_LIGHTS, N_COMPONENTS
+    )
+    found = IndirectLight(model.functions(), model.coefficients(some(shade, np.arange(0))))
+    assert found.is_black
+    assert found.coefficients.shape == (0, 0)
+
+
+@pytest.mark.stability
 def test_duplicates_share_one_answer(rng):
     _, shade = planted(rng, n_texels=50)
     twice = some(shade, np.concatenate([np.arange(50), np.arange(50)]))

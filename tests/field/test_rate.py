@@ -28,6 +28,27 @@ def test_field_of_a_size_comes_close_from_below_wherever_it_begins(build, start,
     assert 0.98 * size < found <= size
 
 
+def test_search_for_a_size_begins_without_a_residual(build):
+    """A model that explains its samples exactly has a residual, and so a step, of 0."""
+    found = PackedSizes().of(field_of_size(build, 0.0, 9_000))
+    assert 0.98 * 9_000 < found <= 9_000
+
+
+def test_search_for_a_quality_begins_without_a_residual(build, parts):
+    def quality(field):
+        return -20 * np.log10(quantisation_error(parts[1], field))
+
+    assert 35.0 <= quality(field_of_quality(build, quality, 0.0, 35.0)) < 36.5
+
+
+@pytest.mark.parametrize("step", [np.nan, -1.0, np.inf])
+def test_steps_that_are_no_numbers_are_refused(build, step):
+    with pytest.raises(InputError, match="step: expected a number >= 0"):
+        field_of_size(build, step, 9_000)
+    with pytest.raises(InputError, match="step: expected a number >= 0"):
+        field_of_quality(build, lambda _: 1.0, step, 35.0)
+
+
 def test_sizes_below_the_surface_are_refused(build):
     with pytest.raises(InputError, match=r"size: expected at least [0-9,]+ bytes"):
         field_of_size(build, 0.1, 1000)
