@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import numba
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from capture_sim.objects import SurfaceMesh
+from capture_sim.open3d_library import open3d as o3d
 
 Array = NDArray[np.float64]
 CameraDict = Mapping[str, Any]

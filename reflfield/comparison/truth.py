@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import open3d
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from reflfield.checks import check_shape
 from reflfield.errors import CaptureError, InputError, ShapeError
+from reflfield.geometry.open3d_library import open3d
 
 Array = NDArray[np.float64]
 

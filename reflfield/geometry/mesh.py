@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import open3d
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
@@ -17,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from reflfield.checks import check_shape
 from reflfield.errors import GeometryError, InputError
+from reflfield.geometry.open3d_library import open3d
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
@@ -17,6 +16,7 @@ from reflfield.capture.lights import Light
 from reflfield.checks import check_shape
 from reflfield.errors import InputError, ShapeError
 from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.open3d_library import open3d
 from reflfield.geometry.texels import TexelTable
 
 Array = NDArray[np.float64]

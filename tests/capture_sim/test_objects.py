@@ -1,12 +1,12 @@
 """Objects: closed where they should be, consistent normals, tangents and coordinates."""
 
 import numpy as np
-import open3d as o3d
 import pytest
 import trimesh
 
 from capture_sim.errors import SceneError
 from capture_sim.objects import make_object, object_presets
+from capture_sim.open3d_library import open3d as o3d
 
 SMALL = {
     "vase": {"preset": "vase", "around": 48, "along": 64},
