@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 import zipfile
 import zlib
@@ -186,13 +187,46 @@ def replacing(path: Path) -> Iterator[Path]:
     earlier file or the new one.
     """
     partial = path.with_name(f".{path.name}.partial")
+    with naming(path):
+        try:
+            yield partial
+            flush_to_disk(partial)
+            partial.replace(path)
+            flush_to_disk(path.parent)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+# What NumPy says of a disk that has no room, with no number of the system.
+_NUMPY_CUT_OFF = re.compile(r"[0-9]+ requested and [0-9]+ written")
+
+
+@contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Give a system's error inside the block that names no file the name of this one.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file or folder that is written.
+
+    Examples
+    --------
+    >>> with naming("results"):
+    ...     raise OSError(errno.ENOSPC, "No space left on device")
+    Traceback (most recent call last):
+    OSError: [Errno 28] No space left on device: 'results'
+    """
     try:
-        yield partial
-        flush_to_disk(partial)
-        partial.replace(path)
-        flush_to_disk(path.parent)
-    finally:
-        partial.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        if error.errno is None and _NUMPY_CUT_OFF.search(str(error)):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        error.strerror = error.strerror or str(error) or type(error).__name__
+        error.filename = str(path)
+        raise
 
 
 def flush_to_disk(path: Path) -> None:

@@ -19,6 +19,7 @@ from reflfield.observations.store import (
     chunk_shape,
     create_samples,
     is_written,
+    open_samples,
 )
 from reflfield.scheduling import Blocks
 
@@ -184,15 +185,14 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
         ):
             block[seen[:, None], i, lights] = values
             n_read += len(lights)
-    # Created before: this opens it.
-    store = create_samples(projection.location, *projection.shape)
+    store = open_samples(projection.location)
     store[:, views.start : views.stop] = block
     return {"photographs": np.array(n_read)}
 
 
 def has_views(projection: Projection, views: range) -> bool:
     """Whether the store holds the samples of some views, whole."""
-    store = create_samples(projection.location, *projection.shape)
+    store = open_samples(projection.location)
     return is_written(store, (slice(None), slice(views.start, views.stop)))
 
 

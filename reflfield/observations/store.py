@@ -8,18 +8,21 @@ it: the views and lights that each texel sees, and the pairs that were photograp
 
 from __future__ import annotations
 
+import atexit
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import zarr
+import zarr.core.sync
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.storage import FsspecStore
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.files import naming
 
 Bools = NDArray[np.bool_]
 # A folder, or the URL of one for fsspec, such as ``s3://bucket/name``.
@@ -33,6 +36,21 @@ CHUNK_BYTES = 1 << 20
 VIEWS_PER_CHUNK = 8
 WRITER_BYTES = 128 << 20
 SAMPLE_BYTES = 6
+# How long a process that ends waits for zarr's thread; zarr waits for 0.2 s, then raises.
+ENDING_SECONDS = 10.0
+
+
+@atexit.register
+def _end_thread_of_zarr() -> None:
+    """Let the thread of zarr's event loop end before zarr closes it, however busy the machine.
+
+    Registered after zarr's own, it is called first; the loop closed while it runs is an
+    exception at the end of a run that went well.
+    """
+    running, thread = zarr.core.sync.loop[0], zarr.core.sync.iothread[0]
+    if running is not None and thread is not None:
+        running.call_soon_threadsafe(running.stop)
+        thread.join(ENDING_SECONDS)
 
 
 def chunk_shape(n_texels: int, n_views: int, n_lights: int) -> tuple[int, int]:
@@ -111,7 +129,7 @@ class ObservationStore:
     @property
     def samples(self) -> zarr.Array:
         """(n_texels, n_views, n_lights, 3) float16 on disk."""
-        return zarr.open_array(opened(self.location), mode="r")
+        return open_samples(self.location, mode="r")
 
     @property
     def n_texels(self) -> int:
@@ -198,6 +216,8 @@ def create_samples(
 ) -> zarr.Array:
     """Create an array of samples, or open the one that an interrupted run began.
 
+    Nothing that is there is ever replaced: what cannot be opened is an error.
+
     Parameters
     ----------
     location : Path or str
@@ -211,31 +231,75 @@ def create_samples(
     Raises
     ------
     InputError
-        If a count is zero.
+        If a count is zero, or something else is there.
+    OSError
+        If the system cannot say what is there, or cannot write.
     """
     for name, count in (("texels", n_texels), ("views", n_views), ("lights", n_lights)):
         if count < 1:
             raise InputError(f"{name}: expected at least one, received {count}")
     shape = (n_texels, n_views, n_lights, 3)
     chunks = (*chunk_shape(n_texels, n_views, n_lights), n_lights, 3)
+    try:
+        found = _opened_array(location, "r+")
+    except FileNotFoundError:
+        return _created(location, shape, chunks)
+    if (found.shape, found.chunks, str(found.dtype)) != (shape, chunks, "float16"):
+        raise InputError(
+            f"{location}: expected float16 samples of shape {shape} in chunks {chunks}, found "
+            f"{found.dtype} of shape {found.shape} in chunks {found.chunks}; remove it, or use "
+            "another place"
+        )
+    return found
+
+
+def _created(location: Location, shape: tuple[int, ...], chunks: tuple[int, ...]) -> zarr.Array:
+    with naming(str(location)):
+        return zarr.create_array(
+            opened(location),
+            shape=shape,
+            chunks=chunks,
+            dtype="float16",
+            fill_value=np.nan,
+            compressors=[BloscCodec(cname="lz4", clevel=1, shuffle="shuffle", typesize=2),
+                         Crc32cCodec()],
+            config={"write_empty_chunks": True},
+            overwrite=False,
+        )  # fmt: skip
+
+
+def open_samples(location: Location, mode: Literal["r", "r+"] = "r+") -> zarr.Array:
+    """Array of samples that was created before.
+
+    Raises
+    ------
+    InputError
+        If it is gone, or its description is damaged.
+    OSError
+        If the system cannot open it.
+    """
+    try:
+        return _opened_array(location, mode)
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{location}: expected samples, found none; compute the stage again with "
+            "--from observations"
+        ) from error
+
+
+def _opened_array(location: Location, mode: Literal["r", "r+"]) -> zarr.Array:
+    """What is there; FileNotFoundError if nothing is."""
     store = opened(location)
     try:
-        found = zarr.open_array(store, mode="r+")
-        if (found.shape, found.chunks, str(found.dtype)) == (shape, chunks, "float16"):
-            return found
-    except (FileNotFoundError, ValueError, KeyError):
-        pass
-    return zarr.create_array(
-        store,
-        shape=shape,
-        chunks=chunks,
-        dtype="float16",
-        fill_value=np.nan,
-        compressors=[BloscCodec(cname="lz4", clevel=1, shuffle="shuffle", typesize=2),
-                     Crc32cCodec()],
-        config={"write_empty_chunks": True},
-        overwrite=True,
-    )  # fmt: skip
+        with naming(str(location)):
+            return zarr.open_array(store, mode=mode)
+    except OSError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{location}: expected samples, found a damaged description of them ({error}); "
+            "remove the folder, then compute the stage again with --from observations"
+        ) from error
 
 
 def is_written(array: zarr.Array, part: tuple[slice, ...]) -> bool:

@@ -1,7 +1,11 @@
 """Store: what is written by views is read by texels, in any order, or found damaged."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+import zarr
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.observations import store
@@ -11,6 +15,7 @@ from reflfield.observations.store import (
     chunk_shape,
     create_samples,
     is_written,
+    open_samples,
 )
 
 
@@ -115,18 +120,84 @@ class TestCreation:
             create_samples(tmp_path / "s", *counts.values())
         assert not (tmp_path / "s").exists()
 
-    def test_replaces_one_of_another_shape_and_keeps_its_own(self, tmp_path):
+    def test_what_is_there_is_opened_again(self, tmp_path):
         create_samples(tmp_path / "s", 3, 2, 2)[:] = 7
         assert (create_samples(tmp_path / "s", 3, 2, 2)[:] == 7).all()
-        other = create_samples(tmp_path / "s", 4, 1, 5)
-        assert other.shape == (4, 1, 5, 3)
-        assert np.isnan(other[:]).all()
 
-    def test_replaces_what_is_no_array(self, tmp_path):
-        (tmp_path / "s").mkdir()
-        (tmp_path / "s" / "zarr.json").write_text("{")
-        assert create_samples(tmp_path / "s", 3, 2, 2).shape == (3, 2, 2, 3)
+    def test_samples_of_another_shape_are_not_erased(self, tmp_path):
+        create_samples(tmp_path / "s", 3, 2, 2)[:] = 7
+        with pytest.raises(InputError, match=r"s: expected .* shape \(4, 1, 5, 3\) .* found"):
+            create_samples(tmp_path / "s", 4, 1, 5)
+        assert (zarr.open_array(tmp_path / "s", mode="r")[:] == 7).all()
 
+
+class FailsOnce:
+    """An opener that fails the first time, as a server does that is busy."""
+
+    def __init__(self, failure):
+        self.failure, self.open = failure, zarr.open_array
+
+    def __call__(self, *words, **named):
+        failure, self.failure = self.failure, None
+        if failure is not None:
+            raise failure
+        return self.open(*words, **named)
+
+
+class TestAFailureToOpenErasesNothing:
+    @pytest.mark.parametrize(
+        "failure",
+        [
+            PermissionError(13, "Permission denied"),
+            OSError(5, "Input/output error"),
+            TimeoutError("no answer"),
+            ValueError("what no version of zarr says today"),
+            KeyError("shape"),
+        ],
+        ids=lambda failure: type(failure).__name__,
+    )
+    @pytest.mark.parametrize("place", ["folder", "memory"])
+    def test_transient(self, tmp_path, monkeypatch, failure, place):
+        where = tmp_path / "s" if place == "folder" else f"memory://{failure!r:.4}/{place}"
+        create_samples(where, 3, 2, 2)[:] = 7
+        kinds = (OSError, InputError)
+        monkeypatch.setattr(zarr, "open_array", FailsOnce(type(failure)(*failure.args)))
+        with pytest.raises(kinds) as raised:
+            create_samples(where, 3, 2, 2)
+        named = getattr(raised.value, "filename", None) or str(raised.value)
+        assert str(where) in named
+        assert (create_samples(where, 3, 2, 2)[:] == 7).all()
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", '{"zarr_format": 3}'])
+    def test_damaged_description(self, tmp_path, text):
+        create_samples(tmp_path / "s", 3, 2, 2)[:] = 7
+        described = (tmp_path / "s" / "zarr.json").read_bytes()
+        (tmp_path / "s" / "zarr.json").write_text(text)
+        with pytest.raises(InputError, match="s: expected samples, found a damaged"):
+            create_samples(tmp_path / "s", 3, 2, 2)
+        (tmp_path / "s" / "zarr.json").write_bytes(described)
+        assert (create_samples(tmp_path / "s", 3, 2, 2)[:] == 7).all()
+
+    def test_gone_it_is_not_made_by_who_only_writes_into_it(self, tmp_path):
+        with pytest.raises(InputError, match="s: expected samples, found none"):
+            open_samples(tmp_path / "s")
+        assert not (tmp_path / "s").exists()
+
+
+def test_the_end_of_a_process_waits_for_the_thread_of_zarr(tmp_path):
+    """Which is busy for longer than zarr would wait."""
+    code = (
+        "import sys, time, zarr.core.sync\n"
+        "from reflfield.observations.store import create_samples\n"
+        "create_samples(sys.argv[1], 3, 2, 2)\n"
+        "zarr.core.sync.loop[0].call_soon_threadsafe(time.sleep, 0.5)\n"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "s")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+class TestChunks:
     @pytest.mark.parametrize("shape", [(1, 1, 1), (40_000, 149, 149), (200_000, 16, 1)])
     def test_chunks_are_of_a_useful_size(self, shape):
         texels, views = chunk_shape(*shape)
