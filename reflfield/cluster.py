@@ -55,6 +55,9 @@ class ClusterWork:
         ``function(context, block)``.
     context : object
         Shared by all blocks.
+    at_once : int, optional
+        At most so many blocks in the hands of one worker, so that it computes no more of them
+        at a time.
 
     Attributes
     ----------
@@ -63,8 +66,15 @@ class ClusterWork:
         were lost or failed.
     """
 
-    def __init__(self, address: str, function: Callable[[Any, Any], Any], context: Any) -> None:
+    def __init__(
+        self,
+        address: str,
+        function: Callable[[Any, Any], Any],
+        context: Any,
+        at_once: int | None = None,
+    ) -> None:
         self.begun = 0
+        self._at_once = at_once
         self._address, self._function, self._context = address, function, context
         self._token = uuid.uuid4().hex
         self._left: deque[int] = deque()
@@ -167,12 +177,18 @@ class ClusterWork:
         n_in_hand = Counter(address for address, _ in self._in_hand.values())
         for each in range(1, BLOCKS_PER_THREAD + 1):
             for address, n_threads in threads.items():
-                while self._left and n_in_hand[address] < each * n_threads:
+                while self._left and n_in_hand[address] < self._most_in_hand(each, n_threads):
                     number = self._left.popleft()
                     new.append(self._submitted(client, address, blocks[number]))
                     self._in_hand[new[-1]] = (address, number)
                     n_in_hand[address] += 1
         return new
+
+    def _most_in_hand(self, each: int, n_threads: int) -> int:
+        """Blocks that a worker may have: it begins them all at once if it has the threads."""
+        if self._at_once is None or self._at_once >= n_threads:
+            return each * n_threads
+        return self._at_once
 
     def _submitted(
         self, client: distributed.Client, address: str, block: Any
@@ -252,6 +268,25 @@ class _Workers:
         elif self._waited:
             report(name, WAITING_SECONDS, WAITING_SECONDS)
         self._waited = seconds > 0
+
+
+def threads_here(otherwise: int) -> int:
+    """Threads for a block that has threads of its own.
+
+    Parameters
+    ----------
+    otherwise : int
+        What to use in the process that runs the job.
+
+    Returns
+    -------
+    int
+        On a cluster's worker, as many as it was started with, wherever the job runs.
+    """
+    try:
+        return int(distributed.get_worker().state.nthreads)
+    except ValueError:  # no worker is computing this
+        return otherwise
 
 
 @dataclass(frozen=True)

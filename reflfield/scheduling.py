@@ -13,16 +13,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import dask
 import numpy as np
-from dask.callbacks import Callback
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
@@ -117,7 +115,8 @@ class Scheduler:
         keep : callable
             Called once for each block with its number and its result.
         at_once : int, optional
-            At most so many threads, where memory allows no more.
+            At most so many threads, where memory allows no more; of a cluster, of each worker,
+            whose memory is its own.
         done : callable
             Called after each block, from this thread.
 
@@ -135,7 +134,7 @@ class Scheduler:
         if not blocks:
             return 0
         if self.address is not None:
-            work = ClusterWork(self.address, function, context)
+            work = ClusterWork(self.address, function, context, at_once)
             for number, result in work.results(blocks):
                 keep(number, result)
                 done()
@@ -145,14 +144,15 @@ class Scheduler:
         def compute(number: int) -> None:
             keep(number, function(context, blocks[number]))
 
-        tasks = [
-            dask.delayed(compute, pure=False)(number, dask_key_name=f"block-{i:08d}")
-            for i, number in enumerate(blocks)
-        ]
-        finished = Callback(posttask=lambda *_: done())
-        # Of one's own, to be left when no block is at work any more, also after an error.
-        with one_core_blas(), ThreadPoolExecutor(threads) as pool, finished:
-            dask.compute(*tasks, scheduler="threads", pool=pool)
+        # The pool is left when no block is at work any more, also after an error.
+        with one_core_blas(), ThreadPoolExecutor(threads) as pool:
+            computed = [pool.submit(compute, number) for number in blocks]
+            try:
+                for each in as_completed(computed):
+                    each.result()
+                    done()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
         return 0
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.model import Capture
+from reflfield.cluster import threads_here
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.atlas import Atlas, build_atlas
 from reflfield.geometry.hull import visual_hull
@@ -149,7 +150,7 @@ class Sight:
     silhouettes : sequence of (h, w) float32 or None
         Of the views.
     threads : int
-        For rays.
+        For rays; a cluster's worker uses its own number.
     """
 
     capture: Capture
@@ -163,7 +164,7 @@ class Sight:
 def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
     """Which texels some views or lights see, (n_texels, k)."""
     kind, some = block
-    scene = RayScene(context.mesh, threads=context.threads)
+    scene = RayScene(context.mesh, threads=threads_here(context.threads))
     capture, texels, options = context.capture, context.texels, context.options
     if kind == "views":
         columns = [

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reflfield.cluster import BLOCKS_PER_THREAD
+from reflfield.cluster import BLOCKS_PER_THREAD, threads_here
 from reflfield.errors import InputError
 from reflfield.progress import listening
 from reflfield.scheduling import Blocks, Scheduler, Tally
@@ -173,3 +173,35 @@ def test_an_error_of_a_block_is_raised_as_it_is(cluster):
 
     with pytest.raises(InputError, match="block 7: damaged"):
         Scheduler(1, cluster).run(fails, None, {0: 7}, lambda *_: None)
+
+
+def test_no_worker_computes_more_at_once_than_allowed_and_each_counts_its_own_threads(
+    tmp_path, processes
+):
+    from_here = str(Path(__file__).parents[2])
+    running = processes(from_here)
+    running.start(
+        *("worker", running.address, "--no-nanny", "--nthreads", 3, "--no-dashboard"),
+        *("--host", "127.0.0.1"),
+    )
+
+    def wait(folder, block):
+        from reflfield.cluster import threads_here
+
+        mine = Path(folder) / str(block)
+        mine.touch()
+        working = len(list(Path(folder).iterdir()))
+        time.sleep(0.1)
+        mine.unlink()
+        return {"working": np.array(working), "threads": np.array(threads_here(64))}
+
+    most = {}
+    for at_once in (None, 2, 1):
+        folder = tmp_path / str(at_once)
+        folder.mkdir()
+        blocks = Blocks(Scheduler(1, running.address), tmp_path / f"{at_once}.blocks")
+        found = blocks.map("blocks", wait, str(folder), range(9), at_once=at_once)
+        most[at_once] = max(int(arrays["working"]) for arrays in found)
+        assert {int(arrays["threads"]) for arrays in found} == {3}
+    assert most == {None: 3, 2: 2, 1: 1}
+    assert threads_here(64) == 64

@@ -107,6 +107,33 @@ class TestBlocks:
             blocks.map("squares", square, 1, [0, 1, 2])
         assert heard == [("squares", 2, 3), ("squares", 3, 3)]
 
+    def test_progress_of_works_at_the_same_time_is_told_apart(self, tmp_path):
+        """As in a program of one's own that runs two captures in two threads."""
+        heard = {"one": [], "two": []}
+        both = threading.Barrier(2)
+
+        def work(name):
+            def wait(context, block):
+                both.wait(10)
+                return {"block": np.array(block)}
+
+            with listening(lambda *words: heard[name].append(words)):
+                Blocks(Scheduler(), tmp_path / name).map(name, wait, None, range(5))
+
+        threads = [threading.Thread(target=work, args=(name,)) for name in heard]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        for name, words in heard.items():
+            assert words == [(name, n, 5) for n in range(6)]
+
+    def test_after_an_error_no_more_blocks_are_begun(self, tmp_path):
+        failing = Fails(at=0)
+        with pytest.raises(InputError, match="block 0: damaged"):
+            Blocks(Scheduler(), tmp_path).map("squares", failing, 2, range(2000))
+        assert len(failing.seen) < 1000
+
     def test_a_result_that_vanishes_is_named(self, tmp_path):
         found = Blocks(Scheduler(), tmp_path).map("squares", square, 1, [1, 2])
         BlockFiles(tmp_path / "squares").path(1).unlink()
