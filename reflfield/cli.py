@@ -147,7 +147,11 @@ def run(
         typer.Option("--set", metavar="stage.option=value", help="One option; repeatable."),
     ] = None,
     hold_out: Annotated[
-        str, typer.Option(metavar="views=K,lights=K", help="Kept for comparison.")
+        str,
+        typer.Option(
+            metavar="views=K,lights=K",
+            help="Kept for comparison; or photographs=K, or test: the capture's test split.",
+        ),
     ] = "",
     size: Annotated[
         str, typer.Option(metavar="2MB", help="Of the field; the best field of that size.")
@@ -355,11 +359,13 @@ def pipeline_options(config: Path | None, settings: list[str]) -> Any:
 def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     from reflfield.steps.choices import words_of
+    from reflfield.steps.holding_out import held_out_words, left_out_words
 
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
         say(f"{record.name:<18}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
-    for words in words_of(job):
+    say(f"held out: {held_out_words(job.split)}")
+    for words in (*left_out_words(job.capture, job.split), *words_of(job)):
         say(words)
     metrics = job.out / "metrics.json"
     if metrics.is_file() and any(r.name == "report" for r in job.stages.records):

@@ -10,6 +10,7 @@ import types
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -287,25 +288,61 @@ def parse_bytes(text: str, option: str = "--max-memory") -> int:
 
 @dataclass(frozen=True)
 class HoldOut:
-    """How many views and lights a run keeps for comparison.
+    """What a run keeps apart from the field's making, and compares the field with.
 
     Parameters
     ----------
     views, lights : int
-        Spread evenly over the capture; their photographs are not used for the field.
+        Spread evenly over those that have photographs; none of their photographs makes the
+        field.
+    photographs : int
+        Spread evenly over views and lights; these alone are kept apart. Not together with
+        `views` and `lights`.
+    test : bool
+        The photographs that the capture itself sets apart as its test split. Alone.
+
+    Raises
+    ------
+    InputError
+        If a count is negative or no whole number, or two ways to choose are mixed.
+
+    Examples
+    --------
+    >>> HoldOut(views=2, lights=3).lights
+    3
+    >>> HoldOut(views=2, photographs=3)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...
+    reflfield.errors.InputError: --hold-out: expected ... received views=2,photographs=3
     """
 
     views: int = 0
     lights: int = 0
+    photographs: int = 0
+    test: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("views", "lights"):
-            if getattr(self, name) < 0:
-                raise InputError(f"--hold-out {name}: expected >= 0, got {getattr(self, name)}")
+        for name in ("views", "lights", "photographs"):
+            count = getattr(self, name)
+            whole = isinstance(count, Integral) and not isinstance(count, bool)
+            if not whole or count < 0:
+                raise InputError(f"--hold-out {name}: expected a number >= 0, received {count}")
+        by_pairs = self.views > 0 or self.lights > 0
+        if by_pairs + (self.photographs > 0) + self.test > 1:
+            raise InputError(
+                "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
+                f"{self}"
+            )
+
+    def __str__(self) -> str:
+        """As `parse_hold_out` reads it."""
+        counts = {name: getattr(self, name) for name in ("views", "lights", "photographs")}
+        parts = [f"{name}={count}" for name, count in counts.items() if count]
+        return ",".join(parts + ["test"] * self.test)
 
 
 def parse_hold_out(text: str) -> HoldOut:
-    """Counts of ``views=2,lights=3``.
+    """Counts of ``views=2,lights=3`` or ``photographs=4``, or ``test``.
 
     Raises
     ------
@@ -315,13 +352,21 @@ def parse_hold_out(text: str) -> HoldOut:
     Examples
     --------
     >>> parse_hold_out("lights=3")
-    HoldOut(views=0, lights=3)
+    HoldOut(views=0, lights=3, photographs=0, test=False)
     """
     counts: dict[str, int] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
         name, equals, number = part.partition("=")
         count = int(number) if re.fullmatch("[0-9]{1,9}", number) else -1
-        if name not in ("views", "lights") or not equals or count < 0 or name in counts:
-            raise InputError(f"--hold-out: expected views=K,lights=K, received {text!r}")
+        if part == "test":
+            name, count = "test", 1
+        elif name not in ("views", "lights", "photographs") or not equals:
+            count = -1
+        if count < 0 or name in counts:
+            raise InputError(
+                "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
+                f"{text!r}"
+            )
         counts[name] = count
-    return HoldOut(**counts)
+    test = counts.pop("test", 0) > 0
+    return HoldOut(test=test, **counts)

@@ -7,6 +7,7 @@ skipped when neither has changed, written whole or not at all, and resumed after
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from reflfield.steps import (
 from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
+from reflfield.steps.quantising import held_out
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class Stage:
             options=self.options(job.options),
             inputs={**self.reads(job), **{name: job.stages.key(name) for name in before}},
         )
+
+
+def field_metadata_digest(job: Job) -> dict[str, str]:
+    """What the metadata of a field say besides its options."""
+    return {"name": job.capture.name, "held_out": json.dumps(held_out(job))}
 
 
 def frames_digests(job: Job) -> dict[str, str]:
@@ -182,7 +189,7 @@ ORDER = (
         reflectance.write_compression,
         after=("resampling", "indirect"),
         options=lambda options: (options.compression, options.seed),
-        reads=lambda job: {"name": job.capture.name},
+        reads=field_metadata_digest,
     ),
     # the same in the base frames, to compare with
     Stage(
@@ -190,7 +197,7 @@ ORDER = (
         reflectance.write_without_alignment,
         after=("compression",),
         options=lambda options: (options.compression, options.resampling, options.seed),
-        reads=lambda job: {"name": job.capture.name},
+        reads=field_metadata_digest,
         wanted=lambda job: job.options.compares_without_alignment,
     ),
     # held-out photographs against the fields relit from their cameras
@@ -242,7 +249,7 @@ def run(
         Folder for all results; created.
     options : PipelineOptions, optional
     hold_out : HoldOut, optional
-        Views and lights kept for comparison.
+        What is kept for comparison.
     resources : Resources, optional
     first : str, optional
         This stage and all later ones are computed again even if nothing changed.

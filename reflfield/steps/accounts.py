@@ -36,11 +36,7 @@ def accounts_of(job: Job) -> Iterator[Account]:
 
 
 def _photographs(job: Job, projected: dict[str, Any]) -> Account:
-    """Photographs of the capture: projected, held out, or of a held view or light alone."""
-    view = np.isin([p.camera for p in job.capture.photographs], job.held_views)
-    light = np.isin([p.light for p in job.capture.photographs], job.held_lights)
-    both = (view | (len(job.held_views) == 0)) & (light | (len(job.held_lights) == 0))
-    held = (view | light) & both
+    """Photographs of the capture: projected, held out and compared, or neither."""
     return Account(
         "observations",
         "photographs",
@@ -48,9 +44,7 @@ def _photographs(job: Job, projected: dict[str, Any]) -> Account:
         {
             "projected onto the surface": projected["photographs"],
             "held out and compared": len(job.held_frames.photographs),
-            "held out, thinned from the comparison": int(held.sum())
-            - len(job.held_frames.photographs),
-            "of a held-out view or light alone, set aside": int(((view | light) & ~both).sum()),
+            "of a held-out view or light, used for neither": len(job.split.aside),
         },
     )
 

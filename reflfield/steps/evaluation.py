@@ -177,8 +177,8 @@ def _completion_at(job: Job, points: dict[str, NDArray[Any]]) -> CompletionError
     used = np.zeros(asked.shape, bool)
     training = np.ix_(
         np.arange(len(close)),
-        np.setdiff1d(np.arange(job.capture.n_views), job.held_views),
-        np.setdiff1d(np.arange(job.capture.n_lights), job.held_lights),
+        job.split.training_views,
+        job.split.training_lights,
     )
     measured = job.observed
     used[training] = (

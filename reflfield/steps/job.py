@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,9 @@ from reflfield.observations.reading import TexelReader, grid_sides
 from reflfield.observations.store import Location, ObservationStore, Observed
 from reflfield.scheduling import Blocks, Scheduler
 from reflfield.stages import RESTARTABLE, StageFolder, key_of
+from reflfield.steps.holding_out import Split, split_of
 from reflfield.steps.options import PipelineOptions
 
-# Held-out frames are rendered and shown: more than this many say nothing new.
-MOST_HELD_FRAMES = 64
 # What an option says that is decided by comparison.
 AUTO = "auto"
 # In the folder of the observations: the samples, or the name of the place where they are.
@@ -101,37 +100,19 @@ class Job:
         return location
 
     @cached_property
-    def held_views(self) -> NDArray[np.intp]:
-        """Views kept for comparison."""
-        return evenly_spread(self.hold_out.views, self.capture.n_views, "views")
-
-    @cached_property
-    def held_lights(self) -> NDArray[np.intp]:
-        """Lights kept for comparison."""
-        return evenly_spread(self.hold_out.lights, self.capture.n_lights, "lights")
+    def split(self) -> Split:
+        """What each photograph is used for."""
+        return split_of(self.capture, self.hold_out)
 
     @cached_property
     def training(self) -> Capture:
         """The capture without what is held out."""
-        views = np.setdiff1d(np.arange(self.capture.n_views), self.held_views)
-        lights = np.setdiff1d(np.arange(self.capture.n_lights), self.held_lights)
-        return self.capture.subset(views, lights)
+        return self.split.training(self.capture)
 
     @cached_property
     def held_frames(self) -> Capture:
-        """Held-out photographs: of held views under held lights, where both are held.
-
-        With views alone (or lights alone) held out, those views under all lights (those
-        lights from all views), thinned evenly to `MOST_HELD_FRAMES`.
-        """
-        views = self.held_views if len(self.held_views) else np.arange(self.capture.n_views)
-        lights = self.held_lights if len(self.held_lights) else np.arange(self.capture.n_lights)
-        if not len(self.held_views) and not len(self.held_lights):
-            views = views[:0]
-        frames = self.capture.subset(views, lights)
-        n = len(frames.photographs)
-        chosen = np.unique(np.linspace(0, n - 1, min(n, MOST_HELD_FRAMES)).astype(int))
-        return replace(frames, photographs=tuple(frames.photographs[i] for i in chosen))
+        """Held-out photographs that the field is compared with."""
+        return self.split.frames(self.capture)
 
     @property
     def is_plane(self) -> bool:
@@ -261,23 +242,3 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays of an npz file; nothing is unpickled."""
     with np.load(path, allow_pickle=False) as stored:
         return {name: stored[name] for name in stored.files}
-
-
-def evenly_spread(count: int, total: int, what: str) -> NDArray[np.intp]:
-    """Indices of `count` of `total` things, evenly spread.
-
-    Raises
-    ------
-    InputError
-        If none would be left.
-
-    Examples
-    --------
-    >>> evenly_spread(2, 32, "views")
-    array([ 8, 24])
-    """
-    if count and count >= total:
-        raise InputError(
-            f"--hold-out: expected fewer than the {total} {what}, received {count}"
-        )
-    return ((np.arange(count) + 0.5) * total / max(count, 1)).astype(np.intp)

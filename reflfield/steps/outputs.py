@@ -27,7 +27,7 @@ from reflfield.files import replacing
 from reflfield.geometry.visibility import RayScene
 from reflfield.observations.store import ObservationStore
 from reflfield.stages import plain, versions
-from reflfield.steps import choices, evaluation
+from reflfield.steps import choices, evaluation, holding_out
 from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
 from reflfield.steps.rate_distortion import stored_points
@@ -198,8 +198,8 @@ def _subtitle(job: Job) -> str:
     training = job.training
     return (
         f"{training.n_views} views, {training.n_lights} lights, {len(training.photographs)} "
-        f"photographs; {len(job.held_views)} views and {len(job.held_lights)} lights held out; "
-        f"{job.base_reader.n_texels} texels"
+        f"photographs, {job.base_reader.n_texels} texels. "
+        f"Held out: {holding_out.held_out_words(job.split)}."
     )
 
 
@@ -210,6 +210,7 @@ def raw_bytes(job: Job) -> int:
 
 def warnings_of(job: Job) -> Iterator[str]:
     """What a user should look at first."""
+    yield from holding_out.left_out_words(job.capture, job.split)
     unseen = job.base_reader.n_texels - len(job.seen_texels)
     if unseen:
         share = unseen / job.base_reader.n_texels
@@ -250,13 +251,17 @@ def _silhouette_views(job: Job) -> Iterator[sections.SilhouetteView]:
     scene = RayScene(job.surface_atlas.mesh, threads=job.resources.workers)
     for i, camera in enumerate(job.training.cameras):
         photographs = job.training.photograph_index[i]
-        brightest = int(photographs[photographs >= 0][0])
+        photographed = photographs[photographs >= 0]
         row, column = np.indices((camera.height, camera.width))
         pixels = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=1)
         covered = np.isfinite(scene.pixel_depths(camera, pixels))
         yield sections.SilhouetteView(
             name=camera.id,
-            photograph=job.training.read_photograph(brightest),
+            photograph=(
+                job.training.read_photograph(int(photographed[0]))
+                if len(photographed)
+                else np.zeros((camera.height, camera.width, 3), np.float32)
+            ),
             silhouette=job.view_silhouettes[i],
             hull_silhouette=covered.reshape(camera.height, camera.width).astype(np.float32),
         )

@@ -186,7 +186,14 @@ def field_metadata(job: Job, made_with: dict[str, Any]) -> dict[str, Any]:
         "views": job.training.n_views,
         "lights": job.training.n_lights,
         "photographs": len(job.training.photographs),
-        "held_out": {"views": job.hold_out.views, "lights": job.hold_out.lights},
+        "held_out": held_out(job),
         "options": options,
         "versions": versions(),
     }
+
+
+def held_out(job: Job) -> dict[str, int]:
+    """What of the capture did not make the field."""
+    held = {"views": job.hold_out.views, "lights": job.hold_out.lights}
+    chosen = job.hold_out.photographs > 0 or job.hold_out.test
+    return held | ({"photographs": len(job.split.compared)} if chosen else {})
