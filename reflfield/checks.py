@@ -81,3 +81,61 @@ def unit_directions(name: str, directions: ArrayLike) -> NDArray[np.float64]:
             "divide each row by its length"
         )
     return vectors / lengths[:, None]
+
+
+def unit_direction(name: str, vector: ArrayLike) -> NDArray[np.float64]:
+    """Unit vector of a direction of any length.
+
+    Parameters
+    ----------
+    name : str
+        Argument name, quoted in the message.
+    vector : (3,) array_like
+
+    Returns
+    -------
+    (3,) float64
+
+    Raises
+    ------
+    InputError
+        If it is not three finite numbers, or zero.
+
+    Examples
+    --------
+    >>> unit_direction("up", [0, 2, 0])
+    array([0., 1., 0.])
+    """
+    array = np.asarray(vector, np.float64)
+    if array.shape != (3,) or not np.isfinite(array).all() or not array.any():
+        raise InputError(
+            f"{name}: expected three finite numbers, not all zero, received {array.tolist()}"
+        )
+    # By the largest first: the squares of very large or small numbers leave the range.
+    array = array / np.abs(array).max()
+    return np.asarray(array / np.linalg.norm(array))
+
+
+# Rotations in files are rounded to a few digits.
+ROTATION_TOLERANCE = 1e-3
+
+
+def not_a_rotation_because(matrix: NDArray[np.float64]) -> str:
+    """What keeps a matrix from being a rotation of space; empty if nothing does.
+
+    Examples
+    --------
+    >>> not_a_rotation_because(np.eye(3)), not_a_rotation_because(np.diag([1.0, 1.0, -1.0]))
+    ('', 'a mirror image (determinant -1)')
+    """
+    if matrix.shape != (3, 3):
+        return f"an array of shape {matrix.shape}"
+    if not np.isfinite(matrix).all():
+        return "numbers that are not finite"
+    if np.abs(matrix).max() > 2 or not np.allclose(
+        matrix @ matrix.T, np.eye(3), rtol=0, atol=ROTATION_TOLERANCE
+    ):
+        return "scale or shear"
+    if np.linalg.det(matrix) < 0:
+        return "a mirror image (determinant -1)"
+    return ""

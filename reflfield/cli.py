@@ -207,15 +207,32 @@ def relight(
     environment: Annotated[
         Path | None, typer.Option(help="Latitude-longitude map for the turntable.")
     ] = None,
-    convention: Annotated[str, typer.Option(help="openexr, mitsuba or blender.")] = "openexr",
+    convention: Annotated[
+        str | None, typer.Option(help="Of the map: openexr (default), mitsuba or blender.")
+    ] = None,
+    environment_up: Annotated[
+        str | None,
+        typer.Option(
+            metavar="AXIS",
+            help="World direction of the map's zenith: X, -Y, ... or x,y,z; the field's up.",
+        ),
+    ] = None,
+    environment_rotation: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEGREES", help="Turn of the map about its zenith, to the left from above."
+        ),
+    ] = None,
     light: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Direction to a distant light.")
     ] = None,
     samples: Samples = 16,
-    size: Annotated[int, typer.Option(help="Side of turntable pictures, pixels.")] = 400,
+    size: Annotated[
+        int | None, typer.Option(help="Side of turntable pictures, pixels; 400.")
+    ] = None,
     elevation: Annotated[
-        float, typer.Option(help="Of the turntable's camera, degrees.")
-    ] = 20.0,
+        float | None, typer.Option(help="Of the turntable's camera, degrees; 20.")
+    ] = None,
     workers: Workers = 0,
     format: Format = None,
 ) -> None:
@@ -225,21 +242,30 @@ def relight(
 
     if (frames is None) == (orbit is None):
         raise InputError("relight: expected either --frames FRAMES or --orbit N, one of them")
-    if frames is not None and (environment or light):
-        raise InputError(
-            "--environment, --light: expected with --orbit; frames bring their own lights"
-        )
+    of_map = {"--convention": convention, "--environment-up": environment_up,
+              "--environment-rotation": environment_rotation}  # fmt: skip
+    of_orbit = {"--environment": environment, "--light": light, "--size": size,
+                "--elevation": elevation}  # fmt: skip
+    refuse_without("--orbit; frames bring their own cameras and lights", orbit, of_orbit)
+    refuse_without("--environment MAP", environment, of_map)
     options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
     opened = open_field(field)
-    made: list[Path] = []
     with showing_progress():
-        if orbit is not None:
-            lights = turntable_lights(environment, convention, light)
-            made = orbit_to(opened, lights, out, options, orbit, size, elevation)
-        elif frames is not None:
+        if frames is not None:
             made = relight_to(opened, frames, out, options, format)
+        else:
+            lights = turntable_lights(opened.up, environment, light, of_map)
+            chosen = {"n_frames": orbit, "size": size, "elevation_deg": elevation}
+            made = orbit_to(opened, lights, out, options, chosen)
     for path in made:
         say(str(path))
+
+
+def refuse_without(needed: str, value: Any, options: dict[str, Any]) -> None:
+    """Refuse options that say nothing without another one."""
+    stated = [name for name, option in options.items() if option is not None]
+    if value is None and stated:
+        raise InputError(f"{', '.join(stated)}: expected with {needed}")
 
 
 def relight_to(
@@ -253,8 +279,10 @@ def relight_to(
     return [frame.exr for frame in relight_frames(field, opened, out, options)]
 
 
-def turntable_lights(environment: Path | None, convention: str, light: str | None) -> Any:
-    """What lights the turntable: a map or one distant light."""
+def turntable_lights(
+    up: Any, environment: Path | None, light: str | None, of_map: dict[str, Any]
+) -> Any:
+    """What lights the turntable: a map, turned to an up direction, or one distant light."""
     import numpy as np
 
     from reflfield.capture.lights import Light
@@ -262,29 +290,42 @@ def turntable_lights(environment: Path | None, convention: str, light: str | Non
 
     if (environment is None) == (light is None):
         raise InputError("relight --orbit: expected either --environment MAP or --light X,Y,Z")
-    if environment is not None:
-        return EnvironmentMap.open(environment, convention)
-    try:
-        direction = [float(part) for part in str(light).split(",")]
-    except ValueError:
-        direction = []
-    if len(direction) != 3 or not any(direction) or not np.isfinite(direction).all():
-        raise InputError(
-            f"--light: expected three finite numbers X,Y,Z, not all zero, received {light!r}"
-        )
-    return Light(
-        "turntable", "directional", direction=np.array(direction), intensity=np.full(3, np.pi)
+    if environment is None:
+        towards = direction_of("--light", str(light))
+        power = np.full(3, np.pi)
+        return Light("turntable", "directional", direction=towards, intensity=power)
+    convention, zenith, rotation = of_map.values()
+    sky = EnvironmentMap.open(environment, convention or "openexr")
+    return sky.turned_to(
+        up if zenith is None else direction_of("--environment-up", zenith, axes=True),
+        rotation or 0.0,
     )
 
 
+def direction_of(option: str, text: str, *, axes: bool = False) -> Any:
+    """Unit direction of ``x,y,z``, or of an axis such as ``-Y`` where `axes` allows it."""
+    from reflfield.checks import unit_direction
+
+    sign, axis = (-1.0 if text.strip().startswith("-") else 1.0), text.strip().lstrip("+-")
+    if axes and axis.upper() in ("X", "Y", "Z"):
+        return unit_direction(option, [sign * (axis.upper() == name) for name in "XYZ"])
+    try:
+        return unit_direction(option, [float(part) for part in text.split(",")])
+    except ValueError:
+        words = "X, Y, Z, -X, -Y, -Z or x,y,z" if axes else "X,Y,Z"
+        raise InputError(
+            f"{option}: expected {words} of finite numbers, not all zero, received {text!r}"
+        ) from None
+
+
 def orbit_to(
-    field: Any, lights: Any, out: Path, options: Any, n_frames: int, size: int, elevation: float
+    field: Any, lights: Any, out: Path, options: Any, chosen: dict[str, Any]
 ) -> list[Path]:
     """Render a turntable; animation and contact sheet."""
     from reflfield.relighting.orbit import OrbitOptions, render_orbit
 
-    up = tuple(field.metadata.get("up", (0.0, 0.0, 1.0)))
-    orbit = OrbitOptions(n_frames=n_frames, up=up, elevation_deg=elevation, size=size)
+    stated = {name: value for name, value in chosen.items() if value is not None}
+    orbit = OrbitOptions(up=tuple(field.up.tolist()), **stated)
     made = render_orbit(field, lights, out, orbit, options)
     return [made.animation, made.contact_sheet]
 

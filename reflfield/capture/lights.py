@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import check_shape
+from reflfield.checks import check_shape, not_a_rotation_because
 from reflfield.errors import CaptureError, InputError
 
 Array = NDArray[np.float64]
@@ -237,9 +237,9 @@ def _check_environment(light: Light) -> None:
             f"received {light.convention!r}"
         )
     rotation = np.array(light.world_from_environment, dtype=np.float64)
-    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+    if reason := not_a_rotation_because(rotation):
         raise CaptureError(
-            f"light {light.id!r}: world_from_environment: expected a 3x3 rotation, "
-            f"received {rotation.tolist()}"
+            f"light {light.id!r}: world_from_environment: expected a 3 x 3 rotation, "
+            f"received {reason}: {rotation.tolist()}"
         )
     object.__setattr__(light, "world_from_environment", rotation)

@@ -34,6 +34,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.checks import unit_direction
 from reflfield.errors import InputError, ShapeError
 from reflfield.field.indirect import IndirectLight
 from reflfield.field.quantisation import (
@@ -211,6 +212,24 @@ class ReflectanceField:
     def n_components(self) -> int:
         """Number of basis functions of a cluster."""
         return int(self.arrays["coefficient_scale"].shape[1])
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) unit world direction that is up, of the capture; +Z where it is not stated.
+
+        Raises
+        ------
+        InputError
+            If the metadata state something else than a direction.
+        """
+        stated = self.metadata.get("up", (0.0, 0.0, 1.0))
+        try:
+            return unit_direction("metadata: up", stated)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(
+                f"metadata: up: expected three finite numbers, not all zero, received "
+                f"{stated!r:.100}"
+            ) from error
 
     @property
     def inverse_power(self) -> int:

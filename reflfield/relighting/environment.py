@@ -1,76 +1,48 @@
 """Environment maps: radiance from all directions, far away.
 
-A map is a latitude-longitude image, row 0 at the zenith. Pixels are areas: the
-centre of pixel (row, column) has ``u = (column + 1/2) / width`` and
-``v = (row + 1/2) / height``, polar angle ``theta = pi v``. Conventions differ in
-what the azimuth means, and in which axis is up:
-
-==========  ====  ===========================================================
-convention  up    direction
-==========  ====  ===========================================================
-openexr     +Y    (sin(2 pi u) sin(theta), cos(theta), -cos(2 pi u) sin(theta))
-mitsuba     +Y    the same
-blender     +Z    (cos(a) sin(theta), sin(a) sin(theta), cos(theta)), a = pi - 2 pi u
-==========  ====  ===========================================================
-
-So the centre of the image is +Z for the first two and +X for Blender.
-
-The OpenEXR library puts the *centres* of the corner pixels on the poles and the
-seam, Mitsuba 3.9 those of the first and last rows on the poles; maps in
-circulation do not, and neither does this module. The difference is half a pixel.
-
-The frame of the map is the frame of the world unless a rotation
-`world_from_environment` is given; a capture with +Z up needs one for a map
-with +Y up.
-
-References
-----------
-.. [1] OpenEXR, ImfEnvmap.h: longitude pi/2 is +X, 0 is +Z.
-.. [2] Mitsuba 3, src/emitters/envmap.cpp.
-.. [3] Blender, intern/cycles/kernel/camera/projection.h:
-       u = (atan2(y, x) - pi) / (-2 pi).
+A map is a latitude-longitude image, twice as wide as high, row 0 at the zenith; see
+`reflfield.relighting.map_directions` for the directions of its pixels and for the way a
+map is turned into a world. A map whose frame in the world is stated
+(`world_from_environment`, as captures state it) is used as it is; else its up axis is
+turned to that of the field it lights.
 """
 
 from __future__ import annotations
 
-import heapq
-from dataclasses import dataclass, field
+import logging
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.capture.images import read_image
+from reflfield.capture.images import image_size, read_image
 from reflfield.capture.lights import CONVENTIONS, Light
-from reflfield.checks import check_shape
+from reflfield.checks import check_shape, not_a_rotation_because
 from reflfield.errors import InputError
+from reflfield.relighting.distant_lights import DistantLights, merged_lights
 from reflfield.relighting.exposure import luminance
+from reflfield.relighting.map_directions import direction_from_uv, world_from_map
 
 Array = NDArray[np.float64]
+logger = logging.getLogger(__name__)
 
 # Maps are reduced to at most this many rows before they are cut into lights:
 # 1.4 degrees a row, finer than the cells of a thousand lights.
 QUANTISATION_ROWS = 128
-
-
-@dataclass(frozen=True, eq=False)
-class DistantLights:
-    """A set of directional lights.
-
-    Parameters
-    ----------
-    directions : (n, 3) float64
-        Unit vectors to the lights, world frame.
-    irradiances : (n, 3) float64
-        Irradiance of a surface that faces each light.
-    """
-
-    directions: Array
-    irradiances: Array
-
-    def __len__(self) -> int:
-        return len(self.directions)
+# Share of the width by which a map may be off twice its height: borders cut or added.
+ASPECT_TOLERANCE = 0.01
+# Other layouts by width / height, and what images of that shape usually are.
+OTHER_LAYOUTS = (
+    (1.0, "a square: an angular map (light probe), a mirror ball or an octahedral map"),
+    (3 / 4, "a vertical cross of a cube map"),
+    (4 / 3, "a horizontal cross of a cube map"),
+    (6.0, "a horizontal strip of the six faces of a cube map"),
+    (1 / 6, "a vertical strip of the six faces of a cube map"),
+    (4.0, "a latitude-longitude map of one hemisphere"),
+    (1 / 2, "a latitude-longitude map turned by a quarter, or two halves"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +54,19 @@ class EnvironmentMap:
     radiance : (height, width, 3) float32
         Linear radiance, W sr^-1 m^-2; negative values count as 0.
     convention : {"openexr", "mitsuba", "blender"}
-        How pixels turn into directions; see the module.
-    world_from_environment : (3, 3) float
-        Rotation from the map's frame to the world.
+        How pixels turn into directions; see `map_directions`.
+    world_from_environment : (3, 3) float, optional
+        Rotation from the map's frame to the world. By default it is open: the renderer
+        turns the map's up to the field's, and what stands for itself stays in the map's
+        frame.
 
     Raises
     ------
     ShapeError
         If the image is not (height, width, 3).
     InputError
-        If the convention is unknown, the image empty or not finite, or the
-        matrix no rotation.
+        If the convention is unknown, the image empty, not twice as wide as high or not
+        finite, or the matrix no rotation.
 
     Examples
     --------
@@ -106,28 +80,26 @@ class EnvironmentMap:
 
     radiance: NDArray[np.float32]
     convention: str = "openexr"
-    world_from_environment: Array = field(default_factory=lambda: np.eye(3))
+    world_from_environment: Array | None = None
 
     def __post_init__(self) -> None:
         check_shape("radiance", self.radiance, (None, None, 3))
-        if not self.radiance.size or not np.isfinite(self.radiance).all():
-            raise InputError(
-                "radiance: expected an image of finite values, received "
-                f"{self.radiance.shape} with {int(np.isnan(self.radiance).sum())} NaN"
-            )
+        height, width, _ = self.radiance.shape
+        check_latlong("radiance", width, height)
+        _check_radiance("radiance", self.radiance)
         if self.convention not in CONVENTIONS:
             raise InputError(
                 f"convention: expected one of {', '.join(CONVENTIONS)}, "
                 f"received {self.convention!r}"
             )
-        rotation = np.asarray(self.world_from_environment, np.float64)
-        if rotation.shape != (3, 3) or not np.allclose(
-            rotation @ rotation.T, np.eye(3), atol=1e-3
-        ):
-            raise InputError(
-                "world_from_environment: expected a 3 x 3 rotation, "
-                f"received {rotation.tolist()}"
-            )
+        if self.world_from_environment is not None:
+            rotation = np.asarray(self.world_from_environment, np.float64)
+            if reason := not_a_rotation_because(rotation):
+                raise InputError(
+                    f"world_from_environment: expected a 3 x 3 rotation, received {reason}: "
+                    f"{rotation.tolist()}"
+                )
+            object.__setattr__(self, "world_from_environment", rotation)
 
     @classmethod
     def open(
@@ -138,15 +110,24 @@ class EnvironmentMap:
     ) -> EnvironmentMap:
         """Read a map from an image file.
 
+        Negative values, and a map without any light, are told through `logging`.
+
         Raises
         ------
         CaptureError
             If the file cannot be read.
         InputError
-            As the class.
+            As the class; the message names the file.
         """
-        rotation = np.eye(3) if world_from_environment is None else world_from_environment
-        return cls(read_image(path), convention, np.asarray(rotation, np.float64))
+        width, height = image_size(path)
+        check_latlong(str(path), width, height)
+        radiance = read_image(path)
+        _check_radiance(str(path), radiance)
+        _tell_of_oddities(path, radiance)
+        rotation = None
+        if world_from_environment is not None:
+            rotation = np.asarray(world_from_environment, np.float64)
+        return cls(radiance, convention, rotation)
 
     @classmethod
     def of_light(cls, light: Light) -> EnvironmentMap:
@@ -165,14 +146,34 @@ class EnvironmentMap:
             )
         return cls.open(light.file, light.convention, light.world_from_environment)
 
+    def turned_to(self, up: ArrayLike, rotation_deg: float = 0.0) -> EnvironmentMap:
+        """Return the map with its zenith towards a direction of the world.
+
+        Parameters
+        ----------
+        up : (3,) array_like
+            World direction.
+        rotation_deg : float
+            Further turn about it, degrees, counter-clockwise seen from above.
+
+        Raises
+        ------
+        InputError
+            If `up` is no direction or the angle not finite.
+
+        Examples
+        --------
+        >>> sky = EnvironmentMap(np.ones((8, 16, 3), np.float32))
+        >>> (sky.turned_to([0, 0, 1]).world_from_environment @ [0, 1, 0]).round(12) + 0.0
+        array([0., 0., 1.])
+        """
+        rotation = world_from_map(self.convention, up, rotation_deg)
+        return replace(self, world_from_environment=rotation)
+
     @cached_property
     def directions(self) -> Array:
         """(height, width, 3) unit vectors to the pixels' centres, world frame."""
-        height, width, _ = self.radiance.shape
-        u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-        columns, rows = np.meshgrid(u, v)
-        local = direction_from_uv(columns, rows, self.convention)
-        return local @ np.asarray(self.world_from_environment, np.float64).T
+        return self._row_directions(0, len(self.radiance))
 
     @cached_property
     def solid_angles(self) -> Array:
@@ -184,12 +185,6 @@ class EnvironmentMap:
     def quantise(self, n_lights: int) -> DistantLights:
         """Directional lights that together send what the map sends.
 
-        Starting from the whole sphere, the cell whose light would err most, by
-        the sum over its pixels of energy times squared distance to the cell's
-        mean direction, is cut in two at its mean, until there are enough. Each
-        cell becomes one light: the sum of its irradiances, channel by channel,
-        from its energy-weighted mean direction. Nothing is random.
-
         Parameters
         ----------
         n_lights : int
@@ -198,7 +193,7 @@ class EnvironmentMap:
         Returns
         -------
         DistantLights
-            Their irradiances sum to the map's, exactly to rounding.
+            Their irradiances sum to the map's, exactly to rounding; see `merged_lights`.
 
         Raises
         ------
@@ -207,119 +202,92 @@ class EnvironmentMap:
 
         Notes
         -----
-        Cost O(pixels log n_lights), at most 128 rows of pixels. The criterion is
-        that of variance-based colour quantisation (X. Wu, "Color quantization by
-        dynamic programming and principal analysis", ACM TOG 1992), applied to
-        directions.
+        Cost O(pixels + 2 QUANTISATION_ROWS^2 log n_lights).
         """
         if n_lights < 1:
             raise InputError(f"n_lights: expected at least 1, received {n_lights}")
         directions, irradiances = self._reduced()
-        energy = luminance(irradiances)
-        cells = _split(directions, energy, n_lights)
-        return DistantLights(
-            directions=np.stack([_mean_direction(directions[c], energy[c]) for c in cells]),
-            irradiances=np.stack([irradiances[c].sum(axis=0) for c in cells]),
-        )
+        return merged_lights(directions, irradiances, luminance(irradiances), n_lights)
+
+    def _row_directions(self, first: int, end: int) -> Array:
+        """(end - first, width, 3) unit vectors to the pixels of some rows."""
+        height, width, _ = self.radiance.shape
+        u, v = (np.arange(width) + 0.5) / width, (np.arange(first, end) + 0.5) / height
+        columns, rows = np.meshgrid(u, v)
+        local = direction_from_uv(columns, rows, self.convention)
+        if self.world_from_environment is None:
+            return local
+        return local @ self.world_from_environment.T
 
     def _reduced(self) -> tuple[Array, Array]:
         """Directions and irradiances of pixels, merged to at most QUANTISATION_ROWS rows."""
         height = len(self.radiance)
         step = -(-height // QUANTISATION_ROWS)
-        irradiances = np.maximum(self.radiance, 0.0) * self.solid_angles[:, None, None]
-        energy = luminance(irradiances)[..., None]
-        moments = _summed_by_blocks(energy * self.directions, step)
-        merged = _summed_by_blocks(irradiances, step)
+        # Strip by strip: double precision of a whole map takes gigabytes.
+        strips = [self._merged_rows(row, step) for row in range(0, height, step)]
+        directions, irradiances = zip(*strips, strict=True)
+        return np.concatenate(directions), np.concatenate(irradiances)
+
+    def _merged_rows(self, first: int, step: int) -> tuple[Array, Array]:
+        """Directions and irradiances of the blocks of `step` x `step` pixels of some rows."""
+        end = min(first + step, len(self.radiance))
+        directions = self._row_directions(first, end)
+        radiance = np.maximum(self.radiance[first:end], 0.0)
+        irradiances = radiance * self.solid_angles[first:end, None, None]
+        moments = _summed_by_blocks(luminance(irradiances)[..., None] * directions, step)
         # An unlit block has no mean direction; any of its pixels stands for it.
-        spare = self.directions[::step, ::step].reshape(-1, 3)
+        spare = directions[0, ::step]
         lengths = np.linalg.norm(moments, axis=1, keepdims=True)
         unit = np.divide(moments, lengths, out=spare.copy(), where=lengths > 0)
-        return unit, merged
+        return unit, _summed_by_blocks(irradiances, step)
 
 
-def direction_from_uv(u: ArrayLike, v: ArrayLike, convention: str) -> Array:
-    """Directions of image coordinates, in the frame of the map.
+def check_latlong(name: str, width: int, height: int) -> None:
+    """Demand the shape of a latitude-longitude map: twice as wide as high.
 
-    Parameters
-    ----------
-    u, v : (...) array_like
-        Image coordinates in [0, 1], v down.
-    convention : {"openexr", "mitsuba", "blender"}
-        See the module.
-
-    Returns
-    -------
-    (..., 3) float64
-        Unit vectors.
-
-    Examples
-    --------
-    >>> direction_from_uv(0.25, 0.5, "openexr").round(12) + 0.0
-    array([1., 0., 0.])
-    >>> direction_from_uv(0.25, 0.5, "blender").round(12) + 0.0
-    array([0., 1., 0.])
+    Raises
+    ------
+    InputError
+        Saying what an image of that shape usually is.
     """
-    theta, turn = np.pi * np.asarray(v, np.float64), 2 * np.pi * np.asarray(u, np.float64)
-    ring, height = np.sin(theta), np.cos(theta)
-    if convention == "blender":
-        azimuth = np.pi - turn
-        return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), height], axis=-1)
-    return np.stack([ring * np.sin(turn), height, -ring * np.cos(turn)], axis=-1)
+    if width < 1 or height < 1:
+        raise InputError(f"{name}: expected a map with pixels, received {width} x {height}")
+    if abs(width - 2 * height) <= max(1, ASPECT_TOLERANCE * width):
+        return
+    ratio = width / height
+    similar = [words for shape, words in OTHER_LAYOUTS if abs(ratio / shape - 1) < 0.02]
+    looks = f", which looks like {similar[0]}" if similar else ""
+    raise InputError(
+        f"{name}: expected a latitude-longitude map, twice as wide as high, received "
+        f"{width} x {height} pixels{looks}; convert it to latitude-longitude first"
+    )
+
+
+def _check_radiance(name: str, radiance: NDArray[np.floating]) -> None:
+    finite = np.isfinite(radiance).all(axis=2)
+    if not finite.all():
+        row, column = np.argwhere(~finite)[0]
+        raise InputError(
+            f"{name}: expected a map of finite radiance, received "
+            f"{int((~finite).sum())} pixels of NaN or infinity, first at row {row}, column "
+            f"{column}: {radiance[row, column].tolist()}; repair the map (half floats store a "
+            "sun beyond 65504 as infinity: write 32 bits, or clamp it)"
+        )
+
+
+def _tell_of_oddities(path: Path | str, radiance: NDArray[np.float32]) -> None:
+    """Log what a map holds that is allowed and hardly meant."""
+    negative = int((radiance < 0).any(axis=2).sum())
+    if negative:
+        logger.warning(
+            "%s: %d pixels of the map are negative (down to %.3g); they count as 0",
+            path, negative, float(radiance.min()),
+        )  # fmt: skip
+    if not (radiance > 0).any():
+        logger.warning("%s: the map is black; whatever it lights is black", path)
 
 
 def _summed_by_blocks(image: Array, step: int) -> Array:
-    """Sums over step x step blocks of an image, (n_blocks, channels)."""
-    rows = np.add.reduceat(image, np.arange(0, image.shape[0], step), axis=0)
-    blocks = np.add.reduceat(rows, np.arange(0, image.shape[1], step), axis=1)
-    return blocks.reshape(-1, image.shape[2])
-
-
-def _mean_direction(directions: Array, energy: Array) -> Array:
-    mean = energy @ directions
-    length = np.linalg.norm(mean)
-    # Opposite directions of equal energy have no mean; either is as good.
-    return mean / length if length > 0 else directions[0]
-
-
-def _split(directions: Array, energy: Array, n_cells: int) -> list[NDArray[np.intp]]:
-    """Index arrays of at most `n_cells` cells, split where the energy spreads most."""
-    lit = np.flatnonzero(energy > 0)
-    whole = lit if len(lit) else np.arange(1)
-    heap = [(-_spread(directions, energy).sum(), 0, whole)]
-    finished: list[NDArray[np.intp]] = []
-    counter = 1  # breaks ties, so that index arrays are never compared
-    while heap and len(heap) + len(finished) < n_cells:
-        _, _, cell = heapq.heappop(heap)
-        parts = _halves(cell, directions[cell], energy[cell])
-        if parts is None:
-            finished.append(cell)
-            continue
-        for part in parts:
-            error = _spread(directions[part], energy[part]).sum()
-            heapq.heappush(heap, (-error, counter, part))
-            counter += 1
-    return finished + [cell for _, _, cell in sorted(heap, key=lambda entry: entry[1])]
-
-
-def _spread(directions: Array, energy: Array) -> Array:
-    """Energy times squared distance to the mean, for each axis, (3,)."""
-    total = energy.sum()
-    if not total > 0:
-        return np.zeros(3)
-    offsets = directions - energy @ directions / total
-    return energy @ offsets**2
-
-
-def _halves(
-    cell: NDArray[np.intp], directions: Array, energy: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-    """Cut a cell at its mean across the axis of largest spread; None if it cannot be."""
-    spread = _spread(directions, energy)
-    axis = int(np.argmax(spread))
-    if not spread[axis] > 0:
-        return None
-    coordinate = directions[:, axis]
-    upper = coordinate > energy @ coordinate / energy.sum()
-    if upper.all() or not upper.any():
-        return None
-    return cell[~upper], cell[upper]
+    """Sums over blocks of `step` columns of all rows of a strip, (n_blocks, channels)."""
+    blocks = np.add.reduceat(image.sum(axis=0), np.arange(0, image.shape[1], step), axis=0)
+    return np.asarray(blocks)

@@ -25,7 +25,8 @@ from reflfield.capture.lights import ENVIRONMENT, UNKNOWN, Light
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate, sum_lights
 from reflfield.field.model import ReflectanceField
-from reflfield.relighting.environment import DistantLights, EnvironmentMap
+from reflfield.relighting.distant_lights import DistantLights
+from reflfield.relighting.environment import EnvironmentMap
 from reflfield.relighting.rays import (
     FieldSurface,
     Footprints,
@@ -221,6 +222,8 @@ class Renderer:
             key = (light.file, light.convention, frame)
         if key not in self._environments:
             opened = EnvironmentMap.of_light(light) if isinstance(light, Light) else light
+            if opened.world_from_environment is None:
+                opened = opened.turned_to(self.field.up)
             quantised = opened.quantise(self.options.environment_directions)
             self._environments[key] = EnvironmentLighting(self.surface, quantised)
         return self._environments[key]
