@@ -19,6 +19,9 @@ from reflfield.geometry.texels import frames, texture_axes
 
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views: what a GPU binds them as
+# glTF holds single precision: beyond so many extents of the mesh from the origin its rounding
+# would exceed a tenth of the step of a field's positions.
+FAR_EXTENTS = 100.0
 
 
 def write_glb(
@@ -27,7 +30,9 @@ def write_glb(
     """Write mesh, normals, tangents, texture coordinates and base colour.
 
     Opens in any glTF viewer. Texture coordinates are turned to glTF's convention
-    (v downwards); tangents run along u, their fourth component is -1 in mirrored charts.
+    (v downwards); tangents run along u, their fourth component is -1 in mirrored charts. Of a
+    mesh far from the origin, as in a survey's coordinates, the node's translation holds where
+    its centre is.
 
     Parameters
     ----------
@@ -54,16 +59,32 @@ def write_glb(
             f"base_colour: expected sRGB-encoded uint8, received {base_colour.dtype}; encode it"
         )
     buffer = _Buffer()
+    origin = far_origin(atlas.positions)
     attributes = {
-        "POSITION": buffer.add(atlas.positions.astype("<f4"), "VEC3", bounds=True),
+        "POSITION": buffer.add((atlas.positions - origin).astype("<f4"), "VEC3", bounds=True),
         "NORMAL": buffer.add(unit_or_zero(atlas.normals).astype("<f4"), "VEC3"),
         "TANGENT": buffer.add(vertex_tangents(atlas).astype("<f4"), "VEC4"),
         "TEXCOORD_0": buffer.add((atlas.uv * [1.0, -1.0] + [0.0, 1.0]).astype("<f4"), "VEC2"),
     }
     indices = buffer.add(atlas.faces.astype("<u4").ravel(), "SCALAR", target=_INDICES)
     image = buffer.add_bytes(_png(base_colour))
-    document = _document(name, attributes, indices, image) | buffer.description()
+    document = _document(name, attributes, indices, image, origin) | buffer.description()
     write_atomically(path, _glb(document, bytes(buffer.content)))
+
+
+def far_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Translation of the mesh's node: zero, or the centre where single precision needs it.
+
+    Examples
+    --------
+    >>> corners = np.array([[0.0, 0, 0], [2.0, 2, 2]])
+    >>> far_origin(corners), far_origin(corners + 1e6)
+    (array([0., 0., 0.]), array([1000001., 1000001., 1000001.]))
+    """
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    extent = float((high - low).max())
+    is_far = np.abs(positions).max() > FAR_EXTENTS * extent
+    return 0.5 * (low + high) if is_far else np.zeros(3)
 
 
 def vertex_tangents(atlas: Atlas) -> NDArray[np.float64]:
@@ -129,7 +150,11 @@ class _Buffer:
 
 
 def _document(
-    name: str, attributes: dict[str, int], indices: int, image: int
+    name: str,
+    attributes: dict[str, int],
+    indices: int,
+    image: int,
+    origin: NDArray[np.float64],
 ) -> dict[str, object]:
     """Scene with one mesh and one rough dielectric material."""
     material = {
@@ -140,12 +165,15 @@ def _document(
             "roughnessFactor": 0.8,
         },
     }
+    node: dict[str, object] = {"name": name, "mesh": 0}
+    if origin.any():
+        node["translation"] = origin.tolist()
     primitive = {"attributes": attributes, "indices": indices, "material": 0, "mode": 4}
     return {
         "asset": {"version": "2.0", "generator": "reflfield"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": name, "mesh": 0}],
+        "nodes": [node],
         "meshes": [{"name": name, "primitives": [primitive]}],
         "materials": [material],
         "textures": [{"source": 0, "sampler": 0}],

@@ -222,7 +222,9 @@ def _surface_arrays(surface: BaseSurface) -> dict[str, NDArray[Any]]:
     check_shape("uv", surface.uv, (len(surface.positions), 2))
     faces = check_indices("faces", np.asarray(surface.faces), 0, len(surface.positions))
     vertices, faces = neighbours_in_a_row(faces, len(surface.positions))
-    corners = lattice_points(np.asarray(surface.positions)[vertices], POSITION_STEPS)
+    corners = lattice_points(
+        np.asarray(surface.positions)[vertices], POSITION_STEPS, np.float64
+    )
     uv = lattice_points(np.asarray(surface.uv)[vertices], UV_STEPS)
     return {
         "positions": corners.codes,

@@ -502,7 +502,7 @@ def describe(reflectance_field: ReflectanceField) -> FieldDescription:
     f = reflectance_field
     stored = f.arrays.stored_bytes if isinstance(f.arrays, StoredArrays) else {}
     height, width = f.texel_of_pixel.shape
-    parts = {
+    parts: dict[str, NDArray[np.floating]] = {
         "positions": f.positions,
         "coefficients": f.coefficients,
         "mean": f.mean,

@@ -60,7 +60,8 @@ _CODES = ("int8", "int16", "int32")
 # that appears in several arrays must have one length; a number is a fixed one.
 ARRAYS: dict[str, tuple[tuple[str, ...], tuple[str | int, ...]]] = {
     "positions": (("uint16",), ("n_vertices", 3)),
-    "position_box": (("float32",), (4,)),
+    # Files of earlier versions hold float32, which far from the origin is too coarse.
+    "position_box": (("float32", "float64"), (4,)),
     "faces": (("int32",), ("n_faces", 3)),
     "uv": (("uint16",), ("n_vertices", 2)),
     "uv_box": (("float32",), (3,)),
@@ -116,10 +117,12 @@ class ReflectanceField:
     metadata: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
-    def positions(self) -> NDArray[np.float32]:
-        """(n_vertices, 3) float32 vertices, metres, world frame."""
+    def positions(self) -> NDArray[np.float64]:
+        """(n_vertices, 3) float64 vertices, metres, world frame."""
         check_finite("position_box", self.arrays["position_box"])
-        return QuantisedBox(self.arrays["positions"], self.arrays["position_box"]).decode()
+        box = self.arrays["position_box"].astype(np.float64)
+        points = QuantisedBox(self.arrays["positions"], box).decode()
+        return points.astype(np.float64, copy=False)
 
     @cached_property
     def uv(self) -> NDArray[np.float32]:

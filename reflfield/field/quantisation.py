@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
@@ -157,7 +157,9 @@ def rotations_from_codes(codes: NDArray[np.int16], step: float) -> NDArray[np.fl
     return matrix_from_quaternion(quaternions).astype(np.float32)
 
 
-def lattice_points(values: NDArray[np.floating], n_steps: int) -> QuantisedBox:
+def lattice_points(
+    values: NDArray[np.floating], n_steps: int, dtype: DTypeLike = np.float32
+) -> QuantisedBox:
     """Points as integers of a lattice over their bounding box, one step for all axes.
 
     Parameters
@@ -166,6 +168,9 @@ def lattice_points(values: NDArray[np.floating], n_steps: int) -> QuantisedBox:
         Finite.
     n_steps : int
         Along the longest side of the box, at most 65535.
+    dtype : float32 or float64
+        Of the box, and of the points as they are read; float64 where the box may be far from
+        the origin.
 
     Returns
     -------
@@ -187,10 +192,10 @@ def lattice_points(values: NDArray[np.floating], n_steps: int) -> QuantisedBox:
     low = array.min(axis=0, initial=np.inf) if len(array) else np.zeros(array.shape[1])
     size = float((array - low).max(initial=0.0))
     step = np.float32(size / n_steps) if size > 0 else np.float32(1.0)
-    low = low.astype(np.float32)
+    low = low.astype(dtype)
     ratio = np.rint((array - low.astype(np.float64)) / np.float64(step))
     codes = np.clip(ratio, 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    return QuantisedBox(codes, np.concatenate([low, [step]]).astype(np.float32))
+    return QuantisedBox(codes, np.concatenate([low, [step]]).astype(dtype))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,17 +205,17 @@ class QuantisedBox:
     Parameters
     ----------
     codes : (n, d) uint16
-    box : (d + 1,) float32
+    box : (d + 1,) float32 or float64
         Lowest corner, then the step.
     """
 
     codes: NDArray[np.uint16]
-    box: NDArray[np.float32]
+    box: NDArray[np.floating]
 
-    def decode(self) -> NDArray[np.float32]:
-        """Return the points, (n, d) float32."""
+    def decode(self) -> NDArray[np.floating]:
+        """Return the points, (n, d), in the precision of the box."""
         wide = self.codes.astype(np.float64) * np.float64(self.box[-1])
-        return (wide + self.box[:-1]).astype(np.float32)
+        return (wide + self.box[:-1]).astype(self.box.dtype)
 
 
 def check_rotations(matrices: NDArray[np.float64]) -> None:

@@ -318,7 +318,7 @@ def _size_at(view: _View, centre: Array) -> float:
     if view.camera.kind == "orthographic":
         return float(extent / view.camera.fl_x)
     # A point in the camera itself would give size zero.
-    distance = max(np.linalg.norm(view.camera.centre - centre), 1e-6)
+    distance = max(np.linalg.norm(view.camera.centre - centre), np.finfo(np.float64).tiny)
     return float(extent * distance / view.camera.fl_x)
 
 

@@ -56,8 +56,8 @@ class TexelTable:
         Size of the texture.
     pixel : (n, 2) int32
         Row and column.
-    position : (n, 3) float32
-        Point of the surface, metres.
+    position : (n, 3) float64
+        Point of the surface, metres: the object may be small and far from the origin.
     local_from_world : (n, 3, 3) float32
         Rows tangent (along increasing u), binormal, smooth normal; orthonormal
         and right-handed also in mirrored charts.
@@ -81,7 +81,7 @@ class TexelTable:
     height: int
     width: int
     pixel: NDArray[np.int32]
-    position: NDArray[np.float32]
+    position: Array
     local_from_world: NDArray[np.float32]
     area: NDArray[np.float32]
     face: NDArray[np.int32]
@@ -145,7 +145,7 @@ def texel_table(atlas: Atlas, options: TexelOptions | None = None) -> TexelTable
     ...     height=4, width=4)
     >>> texels = texel_table(atlas)
     >>> len(texels), texels.position[0]
-    (10, array([0.125, 0.875, 0.   ], dtype=float32))
+    (10, array([0.125, 0.875, 0.   ]))
     >>> texels.local_from_world[0]
     array([[1., 0., 0.],
            [0., 1., 0.],
@@ -168,7 +168,7 @@ def texel_table(atlas: Atlas, options: TexelOptions | None = None) -> TexelTable
         height=atlas.height,
         width=atlas.width,
         pixel=np.stack(np.unravel_index(pixel_number, shape), axis=1).astype(np.int32),
-        position=position.astype(np.float32),
+        position=position,
         local_from_world=frames(normal, u_axis[face]).astype(np.float32),
         area=texel_area[face].astype(np.float32),
         face=face.astype(np.int32),

@@ -235,7 +235,7 @@ class RayScene:
 def lifted_positions(texels: TexelTable, scene: RayScene, options: VisibilityOptions) -> Array:
     """Texel positions raised off the surface by the ray offset, (n, 3) float64."""
     lift = options.ray_offset * scene.diagonal
-    return texels.position.astype(np.float64) + lift * texels.face_normal
+    return texels.position + lift * texels.face_normal
 
 
 def view_visibility(

@@ -97,7 +97,7 @@ class FieldSurface:
         self, field: ReflectanceField, threads: int = 1, ray_offset: float | None = None
     ) -> None:
         self.field = field
-        self.mesh = Mesh(field.positions.astype(np.float64), field.faces)
+        self.mesh = Mesh(field.positions, field.faces)
         self.scene = RayScene(self.mesh, threads)
         share = VisibilityOptions().ray_offset if ray_offset is None else ray_offset
         self._lift = share * self.scene.diagonal
@@ -222,7 +222,7 @@ class FieldSurface:
         field = self.field
         height, width = field.texel_of_pixel.shape
         atlas = Atlas(
-            positions=field.positions.astype(np.float64),
+            positions=field.positions,
             faces=field.faces,
             uv=np.clip(field.uv, 0.0, 1.0).astype(np.float64),
             chart=np.zeros(len(field.faces), np.int32),
@@ -233,7 +233,7 @@ class FieldSurface:
         table = texel_table(atlas)
         nearest = _nearest_rows(field, table.pixel)
         return (
-            table.position[nearest].astype(np.float64),
+            table.position[nearest],
             table.face_normal[nearest].astype(np.float64),
         )
 

@@ -1,5 +1,6 @@
 import json
 import struct
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -50,6 +51,21 @@ def accessor(path, name):
     width = int(entry["type"][-1])
     array = np.frombuffer(binary, "<f4", entry["count"] * width, view["byteOffset"])
     return array.reshape(-1, width)
+
+
+@pytest.mark.stability
+def test_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
+    """Coordinates of a survey: single precision there has steps of half a metre."""
+    path, far = tmp_path / "atlas.glb", np.array([441547.5, 5121946.5, 2345.0])
+    near = quad()
+    write_glb(path, replace(near, positions=near.positions * 0.1 + far), TEXTURE)
+    document, _ = chunks(path)
+    relative = accessor(path, "POSITION")
+    # To the rounding of a float of the size of the quad.
+    assert np.abs(np.ptp(relative, axis=0) - [0.1, 0.1, 0.0]).max() < 1e-8
+    world = relative + np.array(document["nodes"][0]["translation"])
+    # To the rounding of doubles of five million.
+    assert np.abs(world - (near.positions * 0.1 + far)).max() < 1e-8
 
 
 def test_trimesh_reads_geometry_and_the_texture_the_right_way_up(tmp_path):

@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.field.building import (
+    POSITION_STEPS,
     Quantisation,
     build_field,
     neighbours_in_a_row,
     quantisation_error,
 )
+from reflfield.field.file import open_field, write_field
 from reflfield.field.quantisation import (
     codes_from_rotations,
     lattice_points,
@@ -32,6 +34,24 @@ def test_lattice_is_half_a_step_off_at_most(scale, rng):
     # Corner, step and result are rounded to float32.
     slack = 4 * np.finfo(np.float32).eps * np.abs(points).max()
     assert np.abs(box.decode() - points).max() <= 0.5 * step + slack + 1000 * slack
+
+
+@pytest.mark.stability
+def test_vertices_far_from_the_origin_are_half_a_step_off_at_most(parts, tmp_path):
+    """Coordinates of a survey; the corner of the lattice is kept in double precision."""
+    surface, fitted = parts
+    positions = 0.1 * surface.positions + [441547.5, 5121946.5, 2345.0]
+    field = build_field(replace(surface, positions=positions), fitted)
+    write_field(tmp_path / "far.rfld", field)
+    read = open_field(tmp_path / "far.rfld")
+    # Vertices follow their triangles: compared at the corners, whose order may differ as well.
+    corners, expected = (
+        np.sort(p[f].reshape(-1, 3), axis=0)
+        for p, f in ((read.positions, read.faces), (positions, surface.faces))
+    )
+    step = np.ptp(positions, axis=0).max() / POSITION_STEPS
+    # Besides, the rounding of doubles of five million.
+    assert np.abs(corners - expected).max() <= 0.5 * step + 4e-9
 
 
 @pytest.mark.parametrize("step", [1e-4, 0.01, 0.2])

@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,6 +118,16 @@ def test_a_quad_is_sampled_at_its_texel_centres(mirrored):
 
 
 @pytest.mark.stability
+@pytest.mark.stability
+def test_texels_far_from_the_origin_stay_apart():
+    """Coordinates of a survey: single precision there has steps of half a metre."""
+    near = texel_table(quad())
+    far = np.array([441547.5, 5121946.5, 2345.0])
+    moved = texel_table(replace(quad(), positions=0.1 * quad().positions + far))
+    # To the rounding of doubles of five million.
+    np.testing.assert_allclose(moved.position - far, 0.1 * near.position, atol=1e-8)
+
+
 def test_degenerate_triangles_have_no_texels_and_break_nothing():
     mesh = torus()
     extra = np.array([[0, 0, 1], [2, 2, 2]])
