@@ -38,6 +38,7 @@ app = typer.Typer(
     help="Dome photographs to relightable objects.",
 )
 errors = Console(stderr=True, highlight=False)
+MISSED = 3  # status where the quality that was asked for is not reached
 GOES_ON = "the same command goes on where it stopped"
 
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")]
@@ -54,14 +55,15 @@ def main() -> None:
     try:
         app()
     except ReflfieldError as error:
-        fail(str(error))
+        fail(str(error), error)
     except OSError as error:  # a folder that cannot be written, a full disk
-        fail(f"{error.filename or 'system'}: {error.strerror or error}")
+        fail(f"{error.filename or 'system'}: {error.strerror or error}", error)
 
 
-def fail(message: str) -> NoReturn:
-    """Say what is wrong, and end with status 2."""
-    say_error(f"reflfield: error: {message}")
+def fail(message: str, error: Exception) -> NoReturn:
+    """Say what is wrong, and what was noted on the error, and end with status 2."""
+    notes = getattr(error, "__notes__", ())
+    say_error(f"reflfield: error: {'; '.join([message, *notes])}")
     sys.exit(2)
 
 
@@ -157,8 +159,12 @@ def run(
         str, typer.Option(metavar="2MB", help="Of the field; the best field of that size.")
     ] = "",
     psnr: Annotated[
-        float, typer.Option(metavar="DB", help="Of the field; the smallest that is as good.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            metavar="DB",
+            help="Of the field; the smallest that is as good. Status 3 if none is.",
+        ),
+    ] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Compute again from here.")
     ] = None,
@@ -175,15 +181,16 @@ def run(
     ] = None,
     format: Format = None,
 ) -> None:
-    """Make a relightable field of a capture, with a report."""
+    """Make a relightable field of a capture, with a report.
+
+    Status 0: done. 2: input cannot be used. 3: done, but --psnr is not reached. 130: Ctrl-C.
+    """
     from reflfield.capture.readers import open_capture
     from reflfield.config import Resources, parse_bytes, parse_hold_out
     from reflfield.pipeline import run as run_pipeline
 
     started = time.perf_counter()
-    asked = [f"compression.size={parse_bytes(size, '--size')}"] if size else []
-    asked += [f"compression.psnr={psnr}"] if psnr else []
-    options = pipeline_options(config, [*(set_ or []), *asked])
+    options = pipeline_options(config, [*(set_ or []), *size_settings(size, psnr)])
     resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler, store)
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own
@@ -397,10 +404,28 @@ def pipeline_options(config: Path | None, settings: list[str]) -> Any:
     return with_tables(PipelineOptions(), merged(tables, parse_settings(settings)))
 
 
+def size_settings(size: str, psnr: float | None) -> list[str]:
+    """Settings of the size or quality that was asked for; neither asks for nothing."""
+    from reflfield.config import parse_bytes
+
+    settings = []
+    if size:
+        settings.append(f"compression.size={parse_bytes(size, '--size')}")
+        if settings[0].endswith("=0") or "-" in size:
+            raise InputError(f"--size: expected more than no bytes, received {size!r}")
+    if psnr is not None:
+        if not 0 < psnr < float("inf"):
+            raise InputError(f"--psnr: expected a number of dB above 0, received {psnr}")
+        settings.append(f"compression.psnr={psnr}")
+    return settings
+
+
 def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     from reflfield.steps.choices import words_of
     from reflfield.steps.holding_out import held_out_words, left_out_words
+    from reflfield.steps.outputs import published
+    from reflfield.steps.quantising import missed_quality
 
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
@@ -408,14 +433,14 @@ def say_results(job: Any, started: float) -> None:
     say(f"held out: {held_out_words(job.split)}")
     for words in (*left_out_words(job.capture, job.split), *words_of(job)):
         say(words)
-    metrics = job.out / "metrics.json"
-    if metrics.is_file() and any(r.name == "report" for r in job.stages.records):
-        say_metrics(json.loads(metrics.read_text()))
+    if job.stages.record("comparison") is not None:
+        say_metrics(json.loads((job.out / "metrics.json").read_text()))
     say(f"total             {time.perf_counter() - started:8.1f} s")
-    for name in ("field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
-                 "metrics.json", "timings.json", "report/index.html"):  # fmt: skip
-        if (job.out / name).is_file():
-            say(f"{job.out / name}")
+    for path in published(job):
+        say(str(path))
+    if missed := missed_quality(job):
+        say_error(f"reflfield: {missed}")
+        raise typer.Exit(MISSED)
 
 
 def say_metrics(metrics: dict[str, Any]) -> None:

@@ -8,7 +8,8 @@ skipped when neither has changed, written whole or not at all, and resumed after
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,7 @@ def try_candidates(job: Job, folder: Path) -> Mapping[str, Any]:
         folders = [job.stages, *(trial.stages for _, trial in tried)]
         trial = choices.trial_of(job, candidate, folders)
         for stage in ORDER[: STAGES.index("comparison") + 1]:
-            if stage.wanted(trial):
+            if stage.wanted(trial) and stage.name != "maps":
                 stage.run(trial)
         choices.keep_comparison(trial, candidate, folder)
         tried.append((candidate, trial))
@@ -191,6 +192,8 @@ ORDER = (
         options=lambda options: (options.compression, options.seed),
         reads=field_metadata_digest,
     ),
+    # the field's frames as pictures, the mesh with its mean texture
+    Stage("maps", outputs.write_maps, after=("compression",)),
     # the same in the base frames, to compare with
     Stage(
         "without_alignment",
@@ -221,7 +224,7 @@ ORDER = (
     Stage(
         "report",
         outputs.write_report_page,
-        after=("choices", "comparison", "rate_distortion"),
+        after=("choices", "maps", "comparison", "rate_distortion"),
         reads=lambda job: {f"choice {i}": text for i, text in enumerate(choices.words_of(job))},
     ),
 )
@@ -285,15 +288,27 @@ def run(
     )
     check_memory(job)
     choices.check_choices(job)
-    with only_run(job.stages.root):
+    with only_run(job.stages.root), telling_where_the_field_is(job):
         for stage in ORDER[: len(wanted)]:
             if stage.name == choices.STAGE:
                 if last == choices.STAGE or choices.first_affected(job) in wanted:
                     job = settled(job)
             elif stage.wanted(job):
                 stage.run(job)
-        outputs.publish(job)
+                outputs.publish(job, stage.name)
+        outputs.publish_records(job)
     return job
+
+
+@contextmanager
+def telling_where_the_field_is(job: Job) -> Iterator[None]:
+    """Note on an error that comes after the field is finished that it is there."""
+    try:
+        yield
+    except Exception as error:
+        if job.stages.record("compression") is not None:
+            error.add_note(f"the field is finished: {job.out / 'field.rfld'}")
+        raise
 
 
 def settled(job: Job) -> Job:

@@ -150,6 +150,12 @@ class Comparison:
         return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
 
 
+def metrics_text(compared: Mapping[str, Any] | None) -> str:
+    """Text of ``metrics.json``: every frame and the mean, nothing beside them."""
+    kept = {"frames": [], "mean": {}} if compared is None else compared
+    return json.dumps({name: kept[name] for name in ("frames", "mean")}, indent=2) + "\n"
+
+
 def object_pixels(silhouette: ArrayLike) -> NDArray[np.bool_]:
     """Pixels that count: coverage >= 0.5, eroded by a disk of radius 2 pixels.
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from reflfield.capture.model import Capture
 from reflfield.capture.readers import open_capture
 from reflfield.comparison.heldout import RelitPairs, compare_with_photographs
-from reflfield.comparison.metrics import Comparison, compare_frames
+from reflfield.comparison.metrics import Comparison, compare_frames, metrics_text
 from reflfield.comparison.truth import (
     CompletionError,
     FrameErrors,
@@ -52,6 +52,9 @@ def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
     for variant, stage in variants(job).items():
         field = open_field(job.stages.root / stage / "field.rfld")
         counts |= _compare(job, field, folder / variant, variant)
+    compared = [folder / MAIN / f"{name}.json" for name in ("heldout", "truth")]
+    main = next((json.loads(path.read_text()) for path in compared if path.is_file()), None)
+    (folder / "metrics.json").write_text(metrics_text(main))
     return {"frames": sum(len(f.photographs) for f in frame_sets(job).values()), **counts}
 
 
@@ -108,12 +111,6 @@ def relit_pairs(job: Job, variant: str = MAIN) -> dict[str, RelitPairs]:
 def metrics_path(job: Job, name: str) -> Path:
     """File of the metrics of one set of frames, relit from the field."""
     return job.stages.root / "comparison" / MAIN / f"{name}.json"
-
-
-def stored_comparison(job: Job, name: str) -> dict[str, Any] | None:
-    """Metrics that the comparison stage has written."""
-    path = metrics_path(job, name)
-    return json.loads(path.read_text()) if path.is_file() else None
 
 
 # --- truth of simulated captures ----------------------------------------------------------

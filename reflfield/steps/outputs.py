@@ -30,8 +30,8 @@ from reflfield.stages import plain, versions
 from reflfield.steps import choices, evaluation, holding_out
 from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
+from reflfield.steps.quantising import missed_quality
 from reflfield.steps.rate_distortion import stored_points
-from reflfield.steps.standalone import metrics_text
 
 # Sets of frames that are compared: title and sentence.
 FRAME_TITLES = {
@@ -40,33 +40,49 @@ FRAME_TITLES = {
 }
 # Memory of one such sample: RGB as half and as float, whether it is observed, twice.
 SAMPLE_BYTES = 24
+AVERAGES = "averages.npz"
 
 
-def publish(job: Job) -> None:
-    """Copy what the stages have made to its place in the output folder.
+# What of a stage's folder goes to which place in the output folder, in the order listed.
+RESULTS = {
+    "compression": {"field.rfld": "field.rfld"},
+    "hull": {"hull.ply": "hull.ply"},
+    "maps": {name: name for name in ("atlas.glb", "normals.exr", "tangents.exr")},
+    "comparison": {"metrics.json": "metrics.json"},
+    "report": {"index.html": "report/index.html"},
+}
+TIMINGS = "timings.json"
 
-    Every file is replaced whole. Files of stages that have not run are not touched.
+
+def publish(job: Job, stage: str) -> None:
+    """Copy what a stage has made to its place in the output folder, each file whole.
+
+    Done as soon as the stage is, so that no later failure withholds it.
     """
-    stages = job.stages.root
-    done = {record.name for record in job.stages.records}
-    files = {
-        "hull": {"hull/hull.ply": "hull.ply"},
-        "compression": {"compression/field.rfld": "field.rfld"},
-        "report": {
-            name: Path(name).name for name in ("report/atlas.glb", "report/normals.exr",
-                                               "report/tangents.exr", "report/metrics.json")
-        } | {"report/index.html": "report/index.html"},
-    }  # fmt: skip
-    for stage, pairs in files.items():
-        for source, target in pairs.items():
-            if stage in done and (stages / source).is_file():
-                (job.out / target).parent.mkdir(parents=True, exist_ok=True)
-                with replacing(job.out / target) as partial:
-                    shutil.copyfile(stages / source, partial)
-    with replacing(job.out / "timings.json") as partial:
+    for source, target in RESULTS.get(stage, {}).items():
+        if job.stages.record(stage) is not None:
+            (job.out / target).parent.mkdir(parents=True, exist_ok=True)
+            with replacing(job.out / target) as partial:
+                shutil.copyfile(job.stages.root / stage / source, partial)
+
+
+def publish_records(job: Job) -> None:
+    """Write how long the stages took, and with which options they ran."""
+    with replacing(job.out / TIMINGS) as partial:
         partial.write_text(json.dumps(timings(job), indent=1) + "\n")
     with replacing(job.out / "options.toml") as partial:
         write_toml(partial, job.asked_options, list(choices.words_of(job)))
+
+
+def published(job: Job) -> list[Path]:
+    """Results of this run in the output folder; none that an earlier run has left there."""
+    names = [
+        target
+        for stage, files in RESULTS.items()
+        if job.stages.record(stage) is not None
+        for target in files.values()
+    ]
+    return [job.out / name for name in (*names, TIMINGS)]
 
 
 def timings(job: Job) -> dict[str, Any]:
@@ -82,15 +98,20 @@ def timings(job: Job) -> dict[str, Any]:
     }
 
 
-def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
-    """Pictures in texture space, the mesh with its mean texture, metrics and the page."""
+def write_maps(job: Job, folder: Path) -> dict[str, Any]:
+    """Pictures in texture space, and the mesh with its mean texture."""
     field = open_field(job.stages.root / "compression" / "field.rfld")
     _write_maps(job, field, folder)
     average = average_samples(job, folder)
+    np.savez_compressed(folder / AVERAGES, average=average)
     _write_mesh(job, average, folder)
-    heldout, truth = (evaluation.stored_comparison(job, name) for name in ("heldout", "truth"))
-    (folder / "metrics.json").write_text(metrics_text(heldout or truth))
-    content = report_content(job, field, average)
+    return {"texels with samples": int(np.isfinite(average).all(axis=1).sum())}
+
+
+def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
+    """The page: everything that was found."""
+    field = open_field(job.stages.root / "compression" / "field.rfld")
+    content = report_content(job, field, job.result("maps", AVERAGES)["average"])
     write_report(folder / "index.html", content)
     return {"sections": len(content.sections)}
 
@@ -211,6 +232,7 @@ def raw_bytes(job: Job) -> int:
 def warnings_of(job: Job) -> Iterator[str]:
     """What a user should look at first."""
     yield from holding_out.left_out_words(job.capture, job.split)
+    yield from filter(None, [missed_quality(job)])
     unseen = job.base_reader.n_texels - len(job.seen_texels)
     if unseen:
         share = unseen / job.base_reader.n_texels

@@ -40,6 +40,9 @@ FINE_SHARE = 1 / 64
 LEAST_PSNR = 0.01
 # A field found for a quality is taken to reach it within this.
 CLOSE_DB = 0.005
+# The finished field is measured on other samples than the search: a missing quality that is
+# less may be by chance.
+CHANCE_DB = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,3 +200,18 @@ def held_out(job: Job) -> dict[str, int]:
     held = {"views": job.hold_out.views, "lights": job.hold_out.lights}
     chosen = job.hold_out.photographs > 0 or job.hold_out.test
     return held | ({"photographs": len(job.split.compared)} if chosen else {})
+
+
+def missed_quality(job: Job) -> str:
+    """What to say of a quality that was asked for and is not reached; empty where it is."""
+    record, asked = job.stages.record("compression"), job.options.compression.psnr
+    if record is None or not asked:
+        return ""
+    reached = record.counts["LDR PSNR of the samples, dB"]
+    if reached >= asked - CHANCE_DB:
+        return ""
+    return (
+        f"quality not reached: {asked:g} dB asked for, {reached:.2f} dB on the samples is the "
+        "most that this model has; raise texture.texels_per_pixel or compression.rank, or ask "
+        "for less"
+    )

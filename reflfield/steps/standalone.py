@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from reflfield.capture.model import Capture
 from reflfield.comparison import sections
 from reflfield.comparison.heldout import compare_with_photographs
-from reflfield.comparison.metrics import Comparison
+from reflfield.comparison.metrics import Comparison, metrics_text
 from reflfield.comparison.report import ReportContent, write_report
 from reflfield.field.model import ReflectanceField
 from reflfield.files import replacing
 from reflfield.relighting.renderer import RenderOptions
-
-
-def metrics_text(compared: Mapping[str, Any] | None) -> str:
-    """Text of ``metrics.json``: every frame and the mean, nothing beside them."""
-    kept = {"frames": [], "mean": {}} if compared is None else compared
-    return json.dumps({name: kept[name] for name in ("frames", "mean")}, indent=2) + "\n"
 
 
 def write_standalone_comparison(

@@ -220,8 +220,8 @@ class TestSecondRun:
     def test_field_without_alignment_follows_the_size_of_that_with_it(self, run_copy, run_tiny):
         run_tiny(run_copy, "--set", "alignment.iterations=2", "--until", "without_alignment")
         again = [stage for stage, reused in states(run_copy).items() if not reused]
-        assert again == ["alignment", "resampling", "compression", "without_alignment"]
-        folders = [run_copy / "stages" / name for name in again[2:]]
+        assert again == ["alignment", "resampling", "compression", "maps", "without_alignment"]
+        folders = [run_copy / "stages" / name for name in (again[2], again[4])]
         sizes = [(folder / "field.rfld").stat().st_size for folder in folders]
         assert abs(sizes[0] - sizes[1]) < 0.02 * sizes[0]
 
@@ -260,6 +260,25 @@ class TestSecondRun:
         (found,) = (r["counts"] for r in records if r["name"] == "compression")
         assert found["LDR PSNR of the samples, dB"] >= wanted - 0.05
         assert found["field bytes"] < made["field bytes"]
+
+    def test_a_quality_that_is_not_reached_is_said_and_has_a_status_of_its_own(
+        self, run_copy, run_tiny
+    ):
+        outcome = run_tiny(run_copy, "--psnr", "60", "--until", "compression")
+        assert outcome.status == 3
+        records = json.loads((run_copy / "timings.json").read_text())["stages"]
+        (made,) = (r["counts"] for r in records if r["name"] == "compression")
+        reached = made["LDR PSNR of the samples, dB"]
+        assert reached < 59
+        (said,) = [s for s in outcome.err.splitlines() if " left" not in s]
+        assert said.startswith(
+            f"reflfield: quality not reached: 60 dB asked for, {reached:.2f} dB"
+        )
+        # What is listed is of this run: the metrics and the report beside it are not.
+        listed = [line for line in outcome.out.splitlines() if line.startswith(str(run_copy))]
+        assert listed == [
+            str(run_copy / name) for name in ("field.rfld", "hull.ply", "timings.json")
+        ]
 
     def test_impossible_sizes_are_refused(self, run_copy, run_tiny):
         outcome = run_tiny(run_copy, "--size", "1KB", "--until", "compression")
