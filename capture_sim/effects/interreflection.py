@@ -78,7 +78,7 @@ class Options:
         Reflections before the last one; what is reflected more often is left out.
     """
 
-    paths: int = bounded(32, low=2, high=65536)
+    paths: int = bounded(32, low=1, high=65536)
     bounces: int = bounded(8, low=1, high=1024)
 
 
@@ -177,15 +177,24 @@ def estimate(
     -------
     radiance, variance : (n, 3, n_lights) float32
         The variance is that of the mean over a point's paths, as if these were
-        independent; stratification makes it somewhat smaller.
+        independent; stratification makes it somewhat smaller. A single path shows no
+        scatter: its square, which is above the variance in the mean, stands for it.
     """
     radiance = np.zeros((len(points), 3, len(lights)), dtype=np.float32)
     variance = np.zeros_like(radiance)
     for block in _blocks(scene, points, lights):
         found = _traced_paths(scene, tracer, points[block], views[block], lights, traced)
         radiance[block] = found.mean(axis=1)
-        variance[block] = found.var(axis=1, ddof=1) / found.shape[1]
+        variance[block] = _variance_of_mean(found)
     return radiance, variance
+
+
+def _variance_of_mean(found: Float32) -> Float32:
+    """Variance of the mean over the paths, axis 1."""
+    n_paths = found.shape[1]
+    if n_paths == 1:
+        return found[:, 0] ** 2
+    return found.var(axis=1, ddof=1) / n_paths
 
 
 @dataclass(frozen=True)
@@ -366,8 +375,9 @@ def _fill_numbers(
             # The R2 sequence of Roberts, turned by the point's own random offsets.
             numbers[n, 0] = (numbers[n, 0] + 0.7548776662466927 * path) % 1.0
             numbers[n, 1] = (numbers[n, 1] + 0.5698402909980532 * path) % 1.0
-            # Paths of the two densities take turns.
-            numbers[n, 2] = (0.5 * numbers[n, 2] + 0.5 * path) % 1.0
+            # Paths of the two densities take turns; one without a partner draws its own.
+            if path ^ 1 < n_paths:
+                numbers[n, 2] = (0.5 * numbers[n, 2] + 0.5 * path) % 1.0
 
 
 @_compiled

@@ -1,4 +1,8 @@
-r"""Values that are whole steps of a digitiser, :math:`\Delta = L_\mathrm{full} / (2^b - 1)`."""
+r"""Values that are whole steps of a digitiser, :math:`\Delta = L_\mathrm{full} / (2^b - 1)`.
+
+What is brighter than full scale is recorded as the largest code. Values below zero, of
+which a pedestal was subtracted (`black_level`), stay: a converter codes them before.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +35,11 @@ class Options:
     full_scale: float = bounded(4.0, low=1e-12)
 
     @property
+    def largest_code(self) -> int:
+        """Steps up to full scale."""
+        return int(2**self.bits - 1)
+
+    @property
     def step(self) -> float:
         """Radiance of one step.
 
@@ -39,11 +48,11 @@ class Options:
         >>> Options(bits=8, full_scale=255.0).step
         1.0
         """
-        return self.full_scale / (2**self.bits - 1)
+        return self.full_scale / self.largest_code
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by half a step.
+    """Bound the change by half a step, and by what full scale cuts off.
 
     Parameters
     ----------
@@ -56,8 +65,12 @@ def needed(scene: Scene) -> Decision:
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("values are continuous: no [effects.quantisation]", 0.0)
+    brightest = scene.brightness.brightest
+    lost = max(0.0, brightest - options.full_scale)
     reason = f"{options.bits} bits up to {options.full_scale:g}: steps of {options.step:.2g}"
-    return Decision(reason, 0.5 * options.step / scene.brightness.percentile99)
+    if lost:
+        reason += f"; values may reach {brightest:.3g}"
+    return Decision(reason, (0.5 * options.step + lost) / scene.brightness.percentile99)
 
 
 def cost(scene: Scene, work: Workload) -> Cost:
@@ -67,7 +80,7 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
-    """Round to whole steps.
+    """Round to whole steps, at most the largest code.
 
     Parameters
     ----------
@@ -83,5 +96,6 @@ def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np
     (...) float32
     """
     del frame
-    step = np.float32(scene.effects.get(Options).step)
-    return np.rint(values / step) * step
+    options = scene.effects.get(Options)
+    step = np.float32(options.step)
+    return np.minimum(np.rint(values / step), np.float32(options.largest_code)) * step

@@ -11,6 +11,7 @@ from capture_sim.effects import (
     quantisation,
     saturation,
     sensor_noise,
+    simulated,
 )
 from capture_sim.effects.sensor import dark_noise, exposed
 from capture_sim.scene import parse_scene
@@ -75,6 +76,33 @@ def test_quantisation_errs_like_a_uniform_variable(rng):
     step = 2.0 / 255
     assert np.abs(error).max() <= step / 2 * (1 + 1e-5)
     assert error.var() == pytest.approx(step**2 / 12, rel=4 * np.sqrt(0.8 / error.size))
+
+
+def test_a_digitiser_clips_at_full_scale():
+    thing = scene(quantisation={"bits": 2, "full_scale": 3.0})
+    values = np.array([-0.6, 0.4, 2.4, 2.6, 3.0, 3.4, 3.6, 1e30, np.inf], np.float32)
+    codes = quantisation.apply(values, thing, frame(thing)).tolist()
+    assert codes == [-1.0, 0.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]
+    deep = scene(quantisation={"bits": 24, "full_scale": 1.0})
+    # The largest code of 24 bits is the largest odd number of a float32.
+    assert quantisation.apply(np.ones(1, np.float32), deep, frame(deep))[0] == 1.0
+
+
+def test_clipping_calls_for_the_digitiser():
+    coarse = {"bits": 24, "full_scale": 1e-3}
+    thing = parse_scene(
+        {
+            "object": {"preset": "sphere"},
+            "material": {"preset": "grey_card"},
+            "cameras": {"preset": "rti"},
+            "lights": {"preset": "rti", "n": 3},
+            "effects": {"quantisation": coarse},
+        }
+    )
+    decision = quantisation.needed(thing)
+    # Brightness as nobody has measured it: all values up to 1.
+    assert decision.bound == pytest.approx(1.0 - 1e-3, rel=1e-6)
+    assert simulated(thing, quantisation)
 
 
 def test_full_wells_cut_off():

@@ -157,6 +157,40 @@ def test_density_of_directions_integrates_to_one(alphas, rng):
     assert np.allclose(np.linalg.norm(outgoing, axis=1), 1.0)
 
 
+@pytest.mark.parametrize("n_paths", range(1, 10))
+def test_any_number_of_paths_is_unbiased(n_paths, rng):
+    """Paths draw from two densities; the mean of g / density is the integral of g."""
+    n_points = 20_000
+    keys = rng.random((n_points, 6)).repeat(n_paths, axis=0).view(np.uint64)
+    numbers = np.zeros((len(keys), 4))
+    interreflection._fill_numbers(keys, np.arange(len(keys)), n_paths, 0, numbers)
+    views = np.tile([0.6, 0.1, np.sqrt(1 - 0.37)], (len(keys), 1))
+    outgoing, density = interreflection.draw_directions(
+        views, np.full((len(keys), 2), 0.2), numbers
+    )
+    cosine = np.maximum(outgoing[:, 2], 0.0)
+    for power, exact in ((1, 1.0), (3, 0.5), (9, 0.2)):  # 2 / (power + 1)
+        means = (cosine**power / np.pi / density).reshape(n_points, n_paths).mean(axis=1)
+        error = means.std(ddof=1) / np.sqrt(n_points)
+        assert error < 0.02 * exact  # a path too many of one kind is off by 3 % and more
+        # 27 comparisons: 4.5 standard errors are exceeded in one of 5,000 runs of them all.
+        assert abs(means.mean() - exact) < 4.5 * error, power
+
+
+def test_an_odd_number_of_paths_gives_the_converged_picture():
+    """Mirror-like metal, of which too many mirrored paths lose a sixth."""
+    converged = estimated(bowl({"preset": "gold"}, paths=512, bounces=2))[1]
+    runs = []
+    for run in range(24):
+        scene = bowl({"preset": "gold"}, paths=3, bounces=2)
+        shift = 1e-12 * (run + 1)  # draws other numbers
+        moved = replace(scene, mesh=replace(scene.mesh, vertices=scene.mesh.vertices + shift))
+        runs.append(estimated(moved)[1].mean(dtype=float))
+    error = np.std(runs, ddof=1) / np.sqrt(len(runs))
+    assert error < 0.04 * converged.mean()
+    assert abs(np.mean(runs) - converged.mean(dtype=float)) < 4.0 * error
+
+
 @pytest.mark.stability
 def test_grazing_points_and_black_material_stay_finite():
     lights = {"preset": "rings", "elevations_deg": [0.5], "counts": [4]}
