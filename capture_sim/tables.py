@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.errors import scene_error
+from capture_sim.inputs import check_regular
 
 Table = Mapping[str, Any]
 Options = TypeVar("Options")
@@ -105,11 +106,11 @@ or correct it
 
     def file(self, key: str, folder: Path) -> Path:
         """Take the path of an existing file, relative to the scene's folder."""
-        path = folder / str(self.require(key))
-        if not path.is_file():
-            raise scene_error(
-                self.name(key), "an existing file", str(path), "paths are relative to the scene"
-            )
+        value = self.require(key)
+        if not isinstance(value, str):
+            raise scene_error(self.name(key), "a path", value)
+        path = folder / value
+        check_regular(path, self.name(key))
         return path
 
     def finish(self) -> None:

@@ -6,21 +6,27 @@ has one channel (roughness, angle, label) or three (linear RGB).
 
 from __future__ import annotations
 
+import struct
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from capture_sim.errors import scene_error
+from capture_sim.inputs import check_memory, check_regular
 from capture_sim.tables import Table, TableReader, check_number, check_vector
 
 Array = NDArray[np.float64]
 LARGEST_IMAGE = 2**26  # pixels; a "small" texture that does not fill the memory
+BYTES_PER_PIXEL = 12  # of 16-bit images while they are decoded
 
 
 class Texture(ABC):
@@ -86,8 +92,10 @@ class Image(Texture):
 
     Parameters
     ----------
-    pixels : (h, w, n_channels) float64
-        Linear values; row 0 is the top, at v = 1.
+    pixels : (h, w, n_channels) float64 or unsigned
+        Linear values; row 0 is the top, at v = 1. With a table: numbers of its entries.
+    table : (n,) float64, optional
+        Linear values that pixels are numbers of, rising or falling.
 
     Examples
     --------
@@ -96,7 +104,8 @@ class Image(Texture):
     array([1. , 0.5])
     """
 
-    pixels: Array
+    pixels: NDArray[Any]
+    table: Array | None = None
 
     def evaluate(self, uv: Array) -> Array:
         """Bilinear values at `uv`."""
@@ -105,14 +114,21 @@ class Image(Texture):
         x, y = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
         fx, fy = (column - x)[:, None], (row - y)[:, None]
         left, right, top, bottom = x % width, (x + 1) % width, y % height, (y + 1) % height
-        upper = self.pixels[top, left] * (1 - fx) + self.pixels[top, right] * fx
-        lower = self.pixels[bottom, left] * (1 - fx) + self.pixels[bottom, right] * fx
+        upper = self._values(top, left) * (1 - fx) + self._values(top, right) * fx
+        lower = self._values(bottom, left) * (1 - fx) + self._values(bottom, right) * fx
         return upper * (1 - fy) + lower * fy
+
+    def _values(self, row: NDArray[np.int64], column: NDArray[np.int64]) -> Array:
+        stored = self.pixels[row, column]
+        return stored if self.table is None else self.table[stored]
 
     @property
     def bounds(self) -> tuple[float, float]:
         """Smallest and largest pixel value."""
-        return float(self.pixels.min()), float(self.pixels.max())
+        ends: list[Any] = [self.pixels.min(), self.pixels.max()]
+        if self.table is not None:
+            ends = [self.table[end] for end in ends]
+        return float(min(ends)), float(max(ends))
 
     @property
     def n_channels(self) -> int:
@@ -351,15 +367,42 @@ def _texture_from_table(
 def _image(reader: TableReader, folder: Path, encoding: str) -> Image:
     path = reader.file("file", folder)
     encoding = reader.choice("encoding", encoding, ["srgb", "linear"])
-    low, high = reader.numbers("range", [0.0, 1.0])
-    pixels = read_image(path)
+    low, high = reader.vector("range", [0.0, 1.0], 2)
+    stored = read_image(path)
+    values = encoded_values(stored.dtype)
     if encoding == "srgb":
-        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
-    return Image(low + (high - low) * pixels)
+        values = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return Image(stored, low + (high - low) * values)
 
 
-def read_image(path: Path) -> Array:
-    """8- or 16-bit image as encoded values in [0, 1], (h, w, 3) float64 RGB.
+def encoded_values(dtype: np.dtype[Any]) -> Array:
+    """Encoded values in [0, 1] that the numbers of 8- or 16-bit images stand for.
+
+    Examples
+    --------
+    >>> encoded_values(np.dtype(np.uint8))[[0, 51, 255]]
+    array([0. , 0.2, 1. ])
+    """
+    largest = int(np.iinfo(dtype).max)
+    return np.arange(largest + 1, dtype=np.float64) / largest
+
+
+@lru_cache(maxsize=16)
+def _read_image(path: Path, written: tuple[int, int]) -> NDArray[Any]:
+    """Image of a file that was written at that time, with that size."""
+    del written
+    stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if stored is None or stored.dtype not in (np.uint8, np.uint16):
+        raise scene_error(str(path), "an 8- or 16-bit PNG, JPEG or TIFF", "something else")
+    if stored.shape[0] * stored.shape[1] > LARGEST_IMAGE:
+        raise scene_error(str(path), f"at most {LARGEST_IMAGE} pixels", str(stored.shape[:2]))
+    turned = np.ascontiguousarray(stored[:, :, ::-1])
+    turned.setflags(write=False)
+    return turned
+
+
+def read_image(path: Path) -> NDArray[Any]:
+    """8- or 16-bit image as it is stored, (h, w, 3) uint8 or uint16 RGB.
 
     Parameters
     ----------
@@ -369,14 +412,33 @@ def read_image(path: Path) -> Array:
     Raises
     ------
     SceneError
-        If the file is no image, is too large, or holds other depths.
+        If the file is no image, is too large, or holds other depths; nothing is decoded
+        before its size is known.
     """
-    stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    if stored is None or stored.dtype not in (np.uint8, np.uint16):
-        raise scene_error(str(path), "an 8- or 16-bit PNG, JPEG or TIFF", "something else")
-    if stored.shape[0] * stored.shape[1] > LARGEST_IMAGE:
-        raise scene_error(str(path), f"at most {LARGEST_IMAGE} pixels", str(stored.shape[:2]))
-    return stored[:, :, ::-1].astype(np.float64) / np.iinfo(stored.dtype).max
+    check_regular(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images; the limit here is smaller
+            with PIL.Image.open(path) as image:
+                width, height = image.size
+    except PIL.Image.DecompressionBombError as error:
+        raise scene_error(
+            str(path), f"at most {LARGEST_IMAGE:,} pixels", "many more", "make it smaller"
+        ) from error
+    except (OSError, ValueError, SyntaxError, TypeError, OverflowError, struct.error) as error:
+        raise scene_error(
+            str(path), "an 8- or 16-bit PNG, JPEG or TIFF", "a damaged or different file"
+        ) from error
+    if width * height > LARGEST_IMAGE:
+        raise scene_error(
+            str(path),
+            f"at most {LARGEST_IMAGE:,} pixels",
+            f"{width} x {height}",
+            "make it smaller",
+        )
+    check_memory(str(path), BYTES_PER_PIXEL * width * height)
+    status = path.stat()
+    return _read_image(path.resolve(), (status.st_mtime_ns, status.st_size))
 
 
 def _checker(reader: TableReader) -> Callable[[Array], Array]:

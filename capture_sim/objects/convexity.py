@@ -12,6 +12,8 @@ from capture_sim.objects.repair import open_edges, places
 FLAT = 1e-6
 # Planes that are tried first: nearly every surface that is not convex shows it there.
 _TRIED = 256
+# Planes whose heights are held at the same time.
+_AT_ONCE = 16
 
 
 def is_convex(mesh: SurfaceMesh) -> bool:
@@ -39,10 +41,13 @@ def is_convex(mesh: SurfaceMesh) -> bool:
     """
     limit = FLAT * 2.0 * mesh.radius
     some = np.linspace(0, len(mesh.faces) - 1, min(_TRIED, len(mesh.faces))).astype(int)
-    heights = _heights(mesh, some)
-    if heights.max() > limit:
-        return False
-    if heights.min() >= -limit:  # all in one plane, seen from one side
+    flat = True
+    for block in np.array_split(some, -(-len(some) // _AT_ONCE)):
+        heights = _heights(mesh, block)
+        if heights.max() > limit:
+            return False
+        flat = flat and bool(heights.min() >= -limit)
+    if flat:  # all in one plane, seen from one side
         return True
     return _bends_outwards(mesh, limit)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +13,34 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from capture_sim.errors import scene_error
-from capture_sim.objects.mesh import Array, Faces, SurfaceMesh, unit, without_slivers
+from capture_sim.errors import SceneError, scene_error
+from capture_sim.inputs import check_memory, check_regular, read_bytes
+from capture_sim.objects.gltf import FolderResolver, check_gltf
+from capture_sim.objects.mesh import (
+    Array,
+    Faces,
+    SurfaceMesh,
+    check_size,
+    unit,
+    without_slivers,
+)
 from capture_sim.objects.repair import places, repaired
+from capture_sim.objects.wavefront import plain_obj, rewritten_obj
 from capture_sim.tables import TableReader
 
+LARGEST_FILE = 4 << 30
+# Memory that reading takes for each byte of a file of this kind, measured; text is taken apart.
+BYTES_PER_BYTE = {"obj": 12, "ply": 14, "stl": 12, "off": 20, "glb": 12, "gltf": 12}
 MOST_FACES = 20_000_000
+_ELEMENTS = (b"vertex", b"face")
 
 
 def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     """Mesh file, turned, centred, scaled and moved."""
     path = reader.file("file", folder)
-    found = repaired(*read_mesh(path))
+    parts = read_mesh(path)
+    check_size(path.name, len(parts[1]))
+    found = repaired(*parts)
     if len(found.faces) == 0:
         raise scene_error(reader.name("file"), "triangles with an area", f"none in {path}")
     vertices = found.vertices
@@ -59,22 +77,69 @@ def read_mesh(path: Path) -> tuple[Array, Faces, Array | None]:
     Raises
     ------
     SceneError
-        If the file cannot be read, is empty, or holds values that are not finite.
+        If the file is of another kind, cannot be read, is empty or damaged, or holds values
+        that are not finite.
     """
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False, skip_materials=True)
-    except Exception as error:  # trimesh raises whatever its parsers meet
-        raise scene_error(
-            str(path), "a mesh file", f"{type(error).__name__}: {error}"
-        ) from error
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in BYTES_PER_BYTE:
+        kinds = ", ".join(name.upper() for name in BYTES_PER_BYTE)
+        raise scene_error(str(path), f"a mesh file ({kinds})", f"{kind.upper() or 'none'}")
+    check_memory(str(path), BYTES_PER_BYTE[kind] * check_regular(path))
+    content = read_bytes(path, LARGEST_FILE)
+    mesh = _parsed(content, kind, path)
     vertices = np.array(mesh.vertices, np.float64).reshape(-1, 3)
-    faces = np.array(mesh.faces, np.int64).reshape(-1, 3)
+    faces = np.array(getattr(mesh, "faces", ()), np.int64).reshape(-1, 3)
     if not 0 < len(faces) <= MOST_FACES:
         raise scene_error(str(path), f"1 to {MOST_FACES} triangles", len(faces))
     inside = (faces >= 0).all() and (faces < len(vertices)).all()
     if not inside or not np.isfinite(vertices).all() or not np.ptp(vertices):
         raise scene_error(str(path), "finite vertices and faces among them", "others")
+    if kind in ("ply", "off"):
+        _check_counts(content, kind, (len(vertices), len(faces)), path)
     return vertices, faces.astype(np.int32), _coordinates(mesh, len(vertices))
+
+
+def _parsed(content: bytes, kind: str, path: Path) -> Any:
+    """Mesh of the bytes of a file, by `trimesh`."""
+    if kind == "obj":
+        content = plain_obj(content, path)
+    elif kind in ("glb", "gltf"):
+        check_gltf(content, kind, path, MOST_FACES)
+    try:
+        return trimesh.load(
+            io.BytesIO(content), file_type=kind, force="mesh", process=False,
+            skip_materials=True, resolver=FolderResolver(path.parent),
+        )  # fmt: skip
+    except SceneError:
+        raise
+    except Exception as error:  # trimesh raises whatever its parsers meet
+        if kind == "obj":
+            rewritten_obj(content, path)  # names the line that is wrong
+        raise scene_error(
+            str(path),
+            f"a whole {kind.upper()} file",
+            f"a damaged, truncated or different one ({type(error).__name__})",
+            "export it again",
+        ) from error
+
+
+def _check_counts(content: bytes, kind: str, mesh: tuple[int, int], path: Path) -> None:
+    """Demand all vertices and faces that the header of a PLY or OFF file promises."""
+    if kind == "ply":
+        header = content[: content.find(b"end_header")]
+        lines = [re.search(rb"element[ \t]+%s[ \t]+(\d{1,18})" % n, header) for n in _ELEMENTS]
+        promised = tuple(0 if line is None else int(line[1]) for line in lines)
+    else:
+        found = re.match(rb"\s*[A-Z]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})", content)
+        promised = (0, 0) if found is None else (int(found[1]), int(found[2]))
+    for name, wanted, count in zip(_ELEMENTS, promised, mesh, strict=True):
+        if wanted > count:
+            raise scene_error(
+                str(path),
+                f"{wanted} elements '{name.decode()}', as the header says",
+                count,
+                "the file is not whole: export it again",
+            )
 
 
 def _coordinates(mesh: Any, n_vertices: int) -> Array | None:

@@ -9,12 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.errors import scene_error
+from capture_sim.inputs import check_memory
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
 # Relative to the size of the object: corners closer than this are one corner.
 SAME_CORNER = 1e-9
+
+
+# Memory that making an object takes for each triangle, measured.
+BYTES_PER_FACE = 1000
+
+
+def check_size(name: str, n_faces: int) -> None:
+    """Demand that an object of so many triangles stays below the ceiling of memory.
+
+    Raises
+    ------
+    SceneError
+        See `capture_sim.inputs.check_memory`.
+    """
+    check_memory(f"{n_faces:,} triangles of {name}", BYTES_PER_FACE * n_faces)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.errors import scene_error
-from capture_sim.materials.textures import read_image
-from capture_sim.objects.mesh import Array, SurfaceMesh, fan, grid_faces, joined, unit
+from capture_sim.materials.textures import encoded_values, read_image
+from capture_sim.objects.mesh import (
+    Array,
+    SurfaceMesh,
+    check_size,
+    fan,
+    grid_faces,
+    joined,
+    unit,
+)
 from capture_sim.tables import TableReader
 
 HeightField = Callable[[Array], Array]
@@ -31,6 +39,7 @@ def relief(reader: TableReader, folder: Path) -> SurfaceMesh:
     depth = reader.number("height", 0.006, low=0.0, high=1e3)
     thickness = reader.number("thickness", 0.01, low=0.0, high=1e3)
     facets = reader.count("facets", 256, low=2, high=2048)
+    check_size("a relief", 2 * facets**2)
     pattern = reader.choice("pattern", "logo", [*_RELIEFS, "image"])
     shape = _image_relief(reader, folder) if pattern == "image" else _RELIEFS[pattern]
     counts = (facets + 1, facets + 1)
@@ -162,7 +171,10 @@ _RELIEFS: dict[str, HeightField] = {
 
 def _image_relief(reader: TableReader, folder: Path) -> HeightField:
     """Height field from the brightness of an image, v up."""
-    pixels = read_image(reader.file("file", folder)).mean(axis=2)
+    stored = read_image(reader.file("file", folder))
+    table = encoded_values(stored.dtype)
+    # Row by row: three channels as float64 would take 24 times the memory of the image.
+    pixels = np.stack([table[row].mean(axis=1) for row in stored])
     height, width = pixels.shape
 
     def relief(uv: Array) -> Array:

@@ -11,6 +11,7 @@ from capture_sim.errors import scene_error
 from capture_sim.objects.mesh import (
     Array,
     SurfaceMesh,
+    check_size,
     fan,
     grid_faces,
     joined,
@@ -158,6 +159,7 @@ def sphere(reader: TableReader, folder: Path) -> SurfaceMesh:
     """Sphere about the origin."""
     radius = reader.number("radius", 0.1, low=1e-6, high=1e3)
     around = reader.count("around", 192, low=8, high=4096)
+    check_size("a sphere", around**2)
     angle = np.linspace(-np.pi / 2.0, np.pi / 2.0, around // 2 + 1)
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     directions[[0, -1], 0] = 0.0  # exactly on the axis
@@ -182,6 +184,7 @@ def vase(reader: TableReader, folder: Path) -> SurfaceMesh:
             "true",
             "the handles would come through the wall; choose one",
         )
+    check_size("a vase", 2 * around * along)
     corners = np.concatenate([VASE_OUTSIDE, VASE_INSIDE if is_open else VASE_LID])
     profile, slopes = smooth_curve(corners, along)
     body = revolve(height * profile, slopes, around, "vase")
@@ -194,6 +197,7 @@ def bowl(reader: TableReader, folder: Path) -> SurfaceMesh:
     radius = reader.number("radius", 0.08, low=1e-4, high=1e3)
     around = reader.count("around", 192, low=8, high=4096)
     along = reader.count("along", 160, low=16, high=4096)
+    check_size("a bowl", 2 * around * along)
     profile, slopes = smooth_curve(np.concatenate([BOWL_OUTSIDE, BOWL_INSIDE]), along)
     return revolve(radius * profile, slopes, around, "bowl")
 
