@@ -5,14 +5,9 @@ Conventions, kept by every camera of the package:
 * ``x_camera = camera_from_world @ x_world``; OpenCV axes: +X right, +Y down, +Z forward.
 * Pixel coordinates are continuous: the centre of the top-left pixel is (0.5, 0.5), so the
   image covers ``[0, width] x [0, height]``.
-* The lens model is OpenCV's: with ``(x, y) = (X/Z, Y/Z)`` and ``r^2 = x^2 + y^2``::
-
-      g  = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2)
-      x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2)
-      y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y
-      u  = fl_x x' + cx,   v = fl_y y' + cy
-
-  An orthographic camera takes ``(x', y') = (X, Y)``; its focal lengths are pixels per metre.
+* ``u = fl_x x' + cx``, ``v = fl_y y' + cy`` for coordinates ``(x', y')`` behind the lens
+  (`reflfield.capture.lenses`). An orthographic camera takes ``(x', y') = (X, Y)``; its focal
+  lengths are pixels per metre.
 """
 
 from __future__ import annotations
@@ -23,25 +18,26 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reflfield.capture import lenses
 from reflfield.checks import check_shape
 from reflfield.errors import CaptureError
 
 Array = NDArray[np.float64]
 
 OPENCV = "opencv"
+FISHEYE = "opencv_fisheye"
 ORTHOGRAPHIC = "orthographic"
+KINDS = (OPENCV, FISHEYE, ORTHOGRAPHIC)
 
 # Calibration files carry six or more digits; a rotation read from one is orthonormal to
 # about 1e-5. Beyond this tolerance the matrix holds scale, shear or a mistake.
 RIGID_TOLERANCE = 1e-3
 
-# Newton's method doubles the digits with every step: lenses in use converge in 5 steps.
-NEWTON_STEPS = 30
-# Residual, in normalised image coordinates, at which a pixel counts as inverted.
-NEWTON_TOLERANCE = 1e-9
-# Leading coefficients below this change nothing within any field of view, but upset the
-# search for roots.
-NEGLIGIBLE = 1e-14
+# Pixels of one side and of an image: the largest sensors have 400 million.
+LONGEST_SIDE, MOST_PIXELS = 65_535, 2**29
+# Of focal lengths, principal points, coefficients and positions; their products and squares
+# stay finite.
+LARGEST_NUMBER = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +48,8 @@ class Camera:
     ----------
     id : str
         Unique name within the capture.
-    kind : {"opencv", "orthographic"}
-        Perspective with lens distortion, or parallel projection.
+    kind : {"opencv", "opencv_fisheye", "orthographic"}
+        Perspective with lens distortion, fisheye, or parallel projection.
     width, height : int
         Image size, pixels.
     fl_x, fl_y : float
@@ -62,14 +58,16 @@ class Camera:
         Principal point in pixels; (0.5, 0.5) is the centre of the top-left pixel.
     camera_from_world : (4, 4) array_like
         Rigid transform to OpenCV camera axes.
-    distortion : tuple of 6 float
-        ``k1, k2, p1, p2, k3, k4`` in the order of `cv2.projectPoints`.
+    distortion : tuple of up to 8 float
+        ``k1, k2, p1, p2, k3, k4, k5, k6`` in the order of `cv2.projectPoints`; those left
+        out are 0. A fisheye has only k1 .. k4.
 
     Raises
     ------
     CaptureError
-        If a size or focal length is not positive, a number is not finite, or
-        `camera_from_world` is not a rigid motion. The message names the camera.
+        If a size or focal length is not positive or beyond its range (`LONGEST_SIDE`,
+        `MOST_PIXELS`, `LARGEST_NUMBER`), a number is not finite, or `camera_from_world` is
+        not a rigid motion. The message names the camera.
 
     Examples
     --------
@@ -94,17 +92,19 @@ class Camera:
     cx: float
     cy: float
     camera_from_world: Array
-    distortion: tuple[float, ...] = (0.0,) * 6
+    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in (OPENCV, ORTHOGRAPHIC):
+        if self.kind not in KINDS:
             raise CaptureError(
-                f"camera {self.id!r}: expected model 'opencv' or 'orthographic', "
-                f"received {self.kind!r}"
+                f"camera {self.id!r}: expected model {', '.join(KINDS)}, received {self.kind!r}"
             )
-        object.__setattr__(self, "camera_from_world", _frozen_matrix(self))
-        object.__setattr__(self, "distortion", tuple(float(k) for k in self.distortion))
         _check_intrinsics(self)
+        for name in ("width", "height"):
+            object.__setattr__(self, name, int(getattr(self, name)))
+        distortion = tuple(float(k) for k in lenses.padded(self.distortion))
+        object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "camera_from_world", _frozen_matrix(self))
 
     @property
     def rotation(self) -> Array:
@@ -129,6 +129,11 @@ class Camera:
     def up(self) -> Array:
         """(3,) unit world direction that points up in the image."""
         return -self.rotation[1]
+
+    @property
+    def keeps_lines_straight(self) -> bool:
+        """Whether straight lines stay straight in the image: no distortion, no fisheye."""
+        return self.kind == ORTHOGRAPHIC or (self.kind == OPENCV and not any(self.distortion))
 
     @property
     def matrix(self) -> Array:
@@ -191,7 +196,7 @@ class Camera:
         if self.kind == ORTHOGRAPHIC:
             origins = self.centre + image @ self.rotation[:2]
             return origins, np.tile(self.forward, (len(image), 1))
-        ideal = undistort(image, self.distortion) if any(self.distortion) else image
+        ideal = image if self.keeps_lines_straight else self._before_lens(image)
         directions = ideal @ self.rotation[:2] + self.rotation[2]
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         return np.tile(self.centre, (len(image), 1)), directions
@@ -237,107 +242,31 @@ class Camera:
 
     @cached_property
     def _largest_radius(self) -> float:
-        return largest_radius(self.distortion)
+        if self.kind == FISHEYE:
+            return lenses.largest_fisheye_radius(self.distortion)
+        return lenses.largest_radius(self.distortion)
+
+    def _before_lens(self, image: Array) -> Array:
+        """Ideal normalised coordinates; NaN where the lens has no inverse."""
+        if self.kind == FISHEYE:
+            return lenses.undistort_fisheye(image, self.distortion)
+        return lenses.undistort(image, self.distortion)
 
     def _through_lens(self, x_camera: Array) -> Array:
-        """Distorted normalised coordinates; NaN where there is no image."""
+        """Normalised coordinates behind the lens; NaN where there is no image."""
         in_front = x_camera[:, 2] > 0
         depth = np.where(in_front, x_camera[:, 2], np.nan)
         # A point almost in the camera's own plane overflows to inf: it is off the image.
         with np.errstate(over="ignore"):
             ideal = x_camera[:, :2] / depth[:, None]
-        if not any(self.distortion):
+        if self.keeps_lines_straight:
             return ideal
         beyond = ~(np.hypot(ideal[:, 0], ideal[:, 1]) < self._largest_radius)
         ideal[beyond] = np.nan
+        if self.kind == FISHEYE:
+            return lenses.distort_fisheye(ideal, self.distortion)
         with np.errstate(over="ignore", invalid="ignore"):
-            return distort(ideal, self.distortion)
-
-
-def distort(ideal: Array, distortion: tuple[float, ...]) -> Array:
-    """Apply OpenCV's lens model to normalised coordinates (n, 2); see the module header.
-
-    Examples
-    --------
-    Barrel distortion k1 = -0.1 at r = 1 pulls the point in by a tenth:
-
-    >>> distort(np.array([[1.0, 0.0]]), (-0.1, 0, 0, 0, 0, 0))
-    array([[0.9, 0. ]])
-    """
-    k1, k2, p1, p2, k3, k4 = distortion
-    x, y = ideal.T
-    r2 = x * x + y * y
-    gain = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + k4 * r2)
-    return np.stack(
-        [
-            x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * gain + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=1,
-    )
-
-
-def undistort(distorted: Array, distortion: tuple[float, ...]) -> Array:
-    """Invert `distort` by Newton's method; NaN where it has no inverse.
-
-    Parameters
-    ----------
-    distorted : (n, 2) float
-        Normalised coordinates behind the lens.
-    distortion : tuple of 6 float
-        ``k1, k2, p1, p2, k3, k4``.
-
-    Returns
-    -------
-    (n, 2) float64
-        Normalised coordinates before the lens, on the branch that contains the axis.
-
-    Examples
-    --------
-    >>> undistort(np.array([[0.9, 0.0]]), (-0.1, 0, 0, 0, 0, 0)).round(12)
-    array([[1., 0.]])
-    """
-    limit = largest_radius(distortion)
-    converged = 4 * np.finfo(np.float64).eps * max(1.0, float(np.abs(distorted).max(initial=0)))
-    with np.errstate(all="ignore"):
-        ideal = distorted * np.minimum(1.0, 0.9 * limit / _radii(distorted))[:, None]
-        for _ in range(NEWTON_STEPS):
-            residual = distort(ideal, distortion) - distorted
-            if np.max(np.abs(residual), initial=0.0) <= converged:
-                break
-            ideal = ideal - _solve_2x2(_lens_jacobian(ideal, distortion), residual)
-            # A step over the fold would land on the wrong branch.
-            ideal = ideal * np.minimum(1.0, limit / _radii(ideal))[:, None]
-        residual = np.abs(distort(ideal, distortion) - distorted).max(axis=1, initial=0.0)
-        failed = ~(residual <= NEWTON_TOLERANCE * np.maximum(1.0, _radii(distorted)))
-    ideal[failed] = np.nan
-    return ideal
-
-
-def largest_radius(distortion: tuple[float, ...]) -> float:
-    """Radius up to which the radial lens model grows, hence can be inverted.
-
-    The first positive root of ``d(r g(r))/dr``, or the pole of `g`; inf if there is none.
-
-    Examples
-    --------
-    ``r - r^3/3`` grows until r = 1:
-
-    >>> largest_radius((-1 / 3, 0, 0, 0, 0, 0))
-    1.0
-    """
-    k1, k2, _, _, k3, k4 = distortion
-    numerator = np.polynomial.Polynomial([1.0, k1, k2, k3])
-    denominator = np.polynomial.Polynomial([1.0, k4])
-    square = np.polynomial.Polynomial([0.0, 1.0])
-    slope = (numerator + 2 * square * numerator.deriv()) * denominator
-    slope = slope - 2 * square * numerator * denominator.deriv()
-    roots = np.concatenate(
-        [polynomial.trim(NEGLIGIBLE).roots() for polynomial in (slope, denominator)]
-    )
-    real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
-    positive = real[real > 0]
-    return float(np.sqrt(positive.min())) if len(positive) else float("inf")
+            return lenses.distort(ideal, self.distortion)
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
@@ -390,60 +319,18 @@ def _points(points: ArrayLike) -> Array:
     return world
 
 
-def _radii(image: Array) -> Array:
-    return np.maximum(np.hypot(image[:, 0], image[:, 1]), np.finfo(np.float64).tiny)
+def not_rigid_because(matrix: Array) -> str:
+    """What keeps a 4x4 matrix from being a rigid motion; empty if nothing does.
 
-
-def _lens_jacobian(ideal: Array, distortion: tuple[float, ...]) -> Array:
-    """(n, 2, 2) derivatives of `distort`."""
-    k1, k2, p1, p2, k3, k4 = distortion
-    x, y = ideal.T
-    r2 = x * x + y * y
-    top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + k4 * r2
-    gain = top / bottom
-    slope = ((k1 + r2 * (2 * k2 + r2 * 3 * k3)) - gain * k4) / bottom  # d gain / d r^2
-    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    jacobian = np.zeros((len(ideal), 2, 2))
-    jacobian[:, 0, 0] = gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    jacobian[:, 1, 1] = gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    jacobian[:, 0, 1] = jacobian[:, 1, 0] = cross
-    return jacobian
-
-
-def _solve_2x2(matrices: Array, right: Array) -> Array:
-    """Cramer's rule; a singular matrix gives inf or NaN instead of an exception."""
-    a, b = matrices[:, 0, 0], matrices[:, 0, 1]
-    c, d = matrices[:, 1, 0], matrices[:, 1, 1]
-    determinant = a * d - b * c
-    x = (d * right[:, 0] - b * right[:, 1]) / determinant
-    y = (a * right[:, 1] - c * right[:, 0]) / determinant
-    return np.stack([x, y], axis=1)
-
-
-def _frozen_matrix(camera: Camera) -> Array:
-    """`camera_from_world` as a read-only rigid float64 matrix."""
-    matrix = np.array(camera.camera_from_world, dtype=np.float64)
-    if matrix.shape != (4, 4):
-        raise CaptureError(
-            f"camera {camera.id!r}: camera_from_world: expected shape (4, 4), "
-            f"received {matrix.shape}"
-        )
-    fault = _not_rigid_because(matrix)
-    if fault:
-        raise CaptureError(
-            f"camera {camera.id!r}: camera_from_world: expected a rotation and a translation, "
-            f"received {fault}; check the calibration that wrote it"
-        )
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    matrix[:3, :3] = u @ vt  # nearest rotation: removes the rounding of text files
-    matrix.setflags(write=False)
-    return matrix
-
-
-def _not_rigid_because(matrix: Array) -> str:
-    """What keeps a 4x4 matrix from being a rigid motion; empty if nothing does."""
+    Examples
+    --------
+    >>> not_rigid_because(np.diag([1.0, 1.0, -1.0, 1.0]))
+    'a mirrored frame (determinant -1)'
+    """
     if not np.isfinite(matrix).all():
         return "numbers that are not finite"
+    if not (np.abs(matrix) <= LARGEST_NUMBER).all():
+        return f"numbers beyond {LARGEST_NUMBER:g}"
     if not np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=RIGID_TOLERANCE):
         return f"the last row {matrix[3].tolist()} instead of [0, 0, 0, 1]"
     singular = np.linalg.svd(matrix[:3, :3], compute_uv=False)
@@ -456,25 +343,66 @@ def _not_rigid_because(matrix: Array) -> str:
     return ""
 
 
+def _frozen_matrix(camera: Camera) -> Array:
+    """`camera_from_world` as a read-only rigid float64 matrix."""
+    matrix = np.array(camera.camera_from_world, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise CaptureError(
+            f"camera {camera.id!r}: camera_from_world: expected shape (4, 4), "
+            f"received {matrix.shape}"
+        )
+    fault = not_rigid_because(matrix)
+    if fault:
+        raise CaptureError(
+            f"camera {camera.id!r}: camera_from_world: expected a rotation and a translation, "
+            f"received {fault}; check the calibration that wrote it"
+        )
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    matrix[:3, :3] = u @ vt  # nearest rotation: removes the rounding of text files
+    matrix.setflags(write=False)
+    return matrix
+
+
 def _check_intrinsics(camera: Camera) -> None:
     """Refuse sizes, focal lengths and numbers that no camera can have."""
-    if camera.width < 1 or camera.height < 1:
+    width, height = camera.width, camera.height
+    if not (width == width // 1 and height == height // 1):
         raise CaptureError(
-            f"camera {camera.id!r}: expected an image size of at least 1 x 1 pixels, "
-            f"received {camera.width} x {camera.height}"
+            f"camera {camera.id!r}: expected an image size in whole pixels, received "
+            f"{width} x {height}"
         )
-    if len(camera.distortion) != 6:
+    in_range = 1 <= width <= LONGEST_SIDE and 1 <= height <= LONGEST_SIDE
+    if not in_range or width * height > MOST_PIXELS:
         raise CaptureError(
-            f"camera {camera.id!r}: expected 6 distortion coefficients "
-            f"(k1, k2, p1, p2, k3, k4), received {len(camera.distortion)}"
+            f"camera {camera.id!r}: expected an image size of at least 1 x 1 pixels and at "
+            f"most {LONGEST_SIDE} along a side and {MOST_PIXELS:,} in all, received "
+            f"{width} x {height}"
+        )
+    n_named = len(lenses.NAMES)
+    if len(camera.distortion) > n_named:
+        raise CaptureError(
+            f"camera {camera.id!r}: expected at most {n_named} distortion coefficients "
+            f"({', '.join(lenses.NAMES)}), received {len(camera.distortion)}"
         )
     numbers = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, *camera.distortion]
-    if not np.isfinite(numbers).all():
+    if not all(abs(n) <= LARGEST_NUMBER for n in numbers):  # False for NaN
         raise CaptureError(
-            f"camera {camera.id!r}: expected finite intrinsics, received {numbers}"
+            f"camera {camera.id!r}: expected finite intrinsics of at most {LARGEST_NUMBER:g}, "
+            f"received {numbers}"
         )
     if camera.fl_x <= 0 or camera.fl_y <= 0:
         raise CaptureError(
             f"camera {camera.id!r}: camera matrix is singular or mirrored: expected fl_x and "
             f"fl_y > 0, received {camera.fl_x} and {camera.fl_y}"
         )
+    _check_fisheye(camera)
+
+
+def _check_fisheye(camera: Camera) -> None:
+    """Refuse coefficients that the fisheye model does not have."""
+    for name, value in zip(lenses.NAMES, camera.distortion, strict=False):
+        if camera.kind == FISHEYE and value != 0 and name not in ("k1", "k2", "k3", "k4"):
+            raise CaptureError(
+                f"camera {camera.id!r}: {name}: expected 0, since a fisheye has only k1 .. k4, "
+                f"received {value}"
+            )

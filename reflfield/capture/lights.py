@@ -29,6 +29,10 @@ KINDS = (POINT, DIRECTIONAL, SPOT, ENVIRONMENT, UNKNOWN, GROUP)
 # Orientation of latitude-longitude maps, as the programs that write them name it.
 CONVENTIONS = ("openexr", "mitsuba", "blender")
 
+# Largest coordinate and largest intensity, in whatever units: what follows from them (squares
+# of distances, irradiances) stays finite in single precision.
+LARGEST_COORDINATE, LARGEST_INTENSITY = 1e12, 1e18
+
 # Two lights closer than this would be one light; it also keeps 1/d^2 finite.
 SMALLEST_DISTANCE = 1e-9
 
@@ -77,7 +81,8 @@ class Light:
     Raises
     ------
     CaptureError
-        If a number is not finite, an intensity negative, a direction zero.
+        If a number is not finite or beyond its range (`LARGEST_COORDINATE`,
+        `LARGEST_INTENSITY`), an intensity negative, a direction zero.
 
     Examples
     --------
@@ -201,6 +206,12 @@ def _vector(light: Light, name: str) -> Array:
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise CaptureError(
             f"light {light.id!r}: {name}: expected 3 finite numbers, received {vector.tolist()}"
+        )
+    largest = LARGEST_INTENSITY if name == "intensity" else LARGEST_COORDINATE
+    if (np.abs(vector) > largest).any():
+        raise CaptureError(
+            f"light {light.id!r}: {name}: expected numbers of at most {largest:g}, received "
+            f"{vector.tolist()}; choose another unit"
         )
     vector.setflags(write=False)
     return vector

@@ -1,9 +1,9 @@
 """Reader of Middlebury multi-view stereo captures: ``*_par.txt`` beside the photographs.
 
 Line 1 holds the number of images; each further line the image name, K and R row by row, and
-t, with ``x_pixel ~ K [R | t] x_world``. Their pixel centres are whole numbers; ours lie at
-.5, so half a pixel is added to the principal point. The lighting was not measured and moves
-with no camera: one unknown light.
+t, with ``x_pixel ~ K [R | t] x_world``; ``#`` begins a comment. Their pixel centres are whole
+numbers; ours lie at .5, so half a pixel is added to the principal point. The lighting was not
+measured and moves with no camera: one unknown light.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.cameras import Camera
-from reflfield.capture.documents import frame_name, path_inside, read_text, unique_names
+from reflfield.capture.cameras import Camera, not_rigid_because
+from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
 from reflfield.capture.images import image_size
-from reflfield.capture.lights import Light
+from reflfield.capture.lights import LARGEST_COORDINATE, Light
 from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.names import frame_name, printable, quoted, unique_names
 from reflfield.capture.orientation import estimated_up
+from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError
 
 SUFFIX = "_par.txt"
@@ -28,13 +30,15 @@ N_NUMBERS = 21
 LARGEST_SKEW = 1e-6
 
 
-def read_middlebury(description: Path) -> Capture:
+def read_middlebury(description: Path, *, follow_links: bool = False) -> Capture:
     """Read a Middlebury capture.
 
     Parameters
     ----------
     description : Path
         Its ``*_par.txt``.
+    follow_links : bool
+        Whether symbolic links may lead out of its folder.
 
     Returns
     -------
@@ -47,22 +51,23 @@ def read_middlebury(description: Path) -> Capture:
         If the count and the lines disagree, a line is malformed, an image is missing, or
         a calibration is not one.
     """
-    root = description.parent
-    lines = [line.split() for line in read_text(description).splitlines() if line.strip()]
+    root, files = description.parent, NamedFiles(description, follow_links=follow_links)
+    lines = uncommented(read_text(description))
     rows = lines[1:]
-    if not rows or not lines[0][0].isdigit() or int(lines[0][0]) != len(rows):
+    if not rows or parse_count(" ".join(lines[0])) != len(rows):
         raise CaptureError(
             f"{description}: expected the number of images in line 1 and as many lines, "
-            f"received {' '.join(lines[0]) if lines else 'nothing'!r} and {len(rows)} lines"
+            f"received {quoted(' '.join(lines[0]) if lines else '')} and {len(rows)} lines"
         )
+    check_counts(str(description), len(rows), 1, len(rows))
     parsed = [_parsed(row, description) for row in rows]
-    paths = [path_inside(root, name, description) for name, _ in parsed]
+    paths = [files.path(name) for name, _ in parsed]
     cameras = tuple(
         _camera(name, numbers, image_size(path), description)
         for (name, numbers), path in zip(parsed, paths, strict=True)
     )
     return Capture(
-        name=root.resolve().name,
+        name=printable(root.resolve().name),
         root=root,
         cameras=cameras,
         lights=(Light("constant", "unknown"),),
@@ -79,28 +84,45 @@ def read_middlebury(description: Path) -> Capture:
     )
 
 
+def uncommented(text: str) -> list[list[str]]:
+    r"""Words of the lines that are left without comments.
+
+    Examples
+    --------
+    >>> uncommented("# two\n2 # images\n\na.png 1")
+    [['2'], ['a.png', '1']]
+    """
+    lines = [line.split("#", 1)[0].split() for line in text.splitlines()]
+    return [words for words in lines if words]
+
+
 def _parsed(row: list[str], description: Path) -> tuple[str, NDArray[np.float64]]:
     """Image name and the 21 numbers of a line; names may hold spaces."""
     name = " ".join(row[:-N_NUMBERS])
-    try:
-        numbers = np.array([float(token) for token in row[-N_NUMBERS:]])
-    except ValueError:
-        numbers = np.zeros(0)
-    if not name or len(numbers) != N_NUMBERS or not np.isfinite(numbers).all():
+    numbers = [parse_number(word) for word in row[-N_NUMBERS:]]
+    if not name or None in numbers:
         raise CaptureError(
             f"{description}: expected an image name and {N_NUMBERS} finite numbers (K, R, t), "
-            f"received {' '.join(row)[:200]!r}"
+            f"received {quoted(' '.join(row))}"
         )
-    return name, numbers
+    array = np.array(numbers, dtype=np.float64)
+    if np.abs(array).max() > LARGEST_COORDINATE:
+        raise CaptureError(
+            f"{description}: camera {quoted(name)}: expected numbers of at most "
+            f"{LARGEST_COORDINATE:g}, received {array.tolist()}"
+        )
+    return name, array
 
 
 def _camera(
     name: str, numbers: NDArray[np.float64], size: tuple[int, int], description: Path
 ) -> Camera:
     intrinsic = numbers[:9].reshape(3, 3)
-    if abs(np.linalg.det(intrinsic)) < 1e-12:
+    lower = [intrinsic[1, 0], intrinsic[2, 0], intrinsic[2, 1]]
+    if abs(np.linalg.det(intrinsic)) < 1e-12 or any(lower) or intrinsic[2, 2] <= 0:
         raise CaptureError(
-            f"{description}: camera {name!r}: camera matrix K is singular: {intrinsic.tolist()}"
+            f"{description}: camera {name!r}: expected a camera matrix K with zeros below its "
+            f"diagonal, received one that is singular or none: {intrinsic.tolist()}"
         )
     intrinsic = intrinsic / intrinsic[2, 2]
     if abs(intrinsic[0, 1]) > LARGEST_SKEW * intrinsic[0, 0]:
@@ -110,6 +132,12 @@ def _camera(
         )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = numbers[9:18].reshape(3, 3), numbers[18:]
+    fault = not_rigid_because(pose)
+    if fault:
+        raise CaptureError(
+            f"{description}: camera {name!r}: expected a rotation R, received {fault}; check "
+            "the order of the numbers (K, R, t)"
+        )
     return Camera(
         id=frame_name(Path(name)),
         kind="opencv",

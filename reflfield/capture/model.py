@@ -54,12 +54,15 @@ class Photograph:
         Indices into the capture's cameras and lights.
     exposures : tuple of Exposure
         One file, or several bracketed ones.
+    is_test : bool
+        True where the capture's maker keeps the photograph for comparison.
     """
 
     name: str
     camera: int
     light: int
     exposures: tuple[Exposure, ...]
+    is_test: bool = False
 
     @property
     def path(self) -> Path:
@@ -107,6 +110,8 @@ class Capture:
         Name of the reader.
     description : Path, optional
         The file that was read.
+    notes : tuple of str, optional
+        What a user should know of how it was read.
 
     Raises
     ------
@@ -124,6 +129,7 @@ class Capture:
     up: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     format: str = "native"
     description: Path | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.silhouettes:
@@ -152,6 +158,11 @@ class Capture:
     def lights_known(self) -> bool:
         """Whether the direction of every light was measured."""
         return all(light.kind != UNKNOWN for light in self.lights)
+
+    @property
+    def test_split(self) -> NDArray[np.intp]:
+        """Indices of the photographs that the capture's maker keeps for comparison."""
+        return np.flatnonzero([photograph.is_test for photograph in self.photographs])
 
     @cached_property
     def photograph_index(self) -> NDArray[np.int64]:

@@ -5,33 +5,41 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from functools import cache
-from importlib.resources import files
+from importlib import resources
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
+from numpy.typing import NDArray
 
-from reflfield.capture.cameras import Camera
-from reflfield.capture.documents import path_inside, read_json, unique_names
+from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
+from reflfield.capture.documents import LARGEST_COORDINATE, check_counts, read_json
+from reflfield.capture.lenses import NAMES as LENS_KEYS
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.names import has_controls, printable, quoted, unique_names
+from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError
 
 FILE_NAME = "capture.json"
 FORMAT = "reflfield-capture"
 VERSION = 1
-DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4")
+# Faults of a description that are looked at to find the most telling one.
+FAULTS_COMPARED = 50
 
 
-def read_native(description: Path) -> Capture:
+def read_native(description: Path, *, follow_links: bool = False) -> Capture:
     """Read a native capture.
 
     Parameters
     ----------
     description : Path
         Its ``capture.json``.
+    follow_links : bool
+        Whether symbolic links may lead out of its folder.
 
     Returns
     -------
@@ -46,25 +54,24 @@ def read_native(description: Path) -> Capture:
     """
     document = read_json(description)
     check_native(document, description)
-    root = description.parent
-    cameras = tuple(_camera(entry) for entry in document["cameras"])
-    lights = tuple(_light(entry, root, description) for entry in document["lights"])
+    root, files = description.parent, NamedFiles(description, follow_links=follow_links)
+    cameras = tuple(_camera(entry, description) for entry in document["cameras"])
+    lights = tuple(_light(entry, files) for entry in document["lights"])
     return Capture(
-        name=document.get("name", root.resolve().name),
+        name=document.get("name", printable(root.resolve().name)),
         root=root,
         cameras=cameras,
         lights=lights,
-        photographs=_photographs(document, cameras, lights, description),
+        photographs=_photographs(document, cameras, lights, files),
         base_geometry=document.get("base_geometry", usual_base_geometry(len(cameras))),
         silhouettes=tuple(
-            path_inside(root, entry["silhouette"], description)
-            if "silhouette" in entry
-            else None
+            files.path(entry["silhouette"]) if "silhouette" in entry else None
             for entry in document["cameras"]
         ),
-        up=np.array(document.get("up", (0.0, 0.0, 1.0))),
+        up=_up(document, description),
         format="native",
         description=description,
+        notes=_notes(document, description),
     )
 
 
@@ -82,11 +89,27 @@ def check_native(document: Mapping[str, Any], description: Path) -> None:
             f"{description}: expected version {VERSION}, received the newer version {version}; "
             "update reflfield"
         )
-    error = best_match(_validator().iter_errors(document))
+    lists = {key: document.get(key) for key in ("cameras", "lights", "photographs")}
+    n_cameras, n_lights, n_listed = (
+        len(value) if isinstance(value, list) else 0 for value in lists.values()
+    )
+    by_pattern = isinstance(document.get("photographs"), dict)
+    n_photographs = n_cameras * n_lights if by_pattern else n_listed
+    check_counts(str(description), n_cameras, n_lights, n_photographs)
+    error = best_match(islice(_validator().iter_errors(document), FAULTS_COMPARED))
     if error is not None:
         where = error.json_path.removeprefix("$").removeprefix(".") or "the description"
         text = error.message if len(error.message) < 300 else error.message[:300] + " ..."
-        raise CaptureError(f"{description}: {where}: {text} (schema capture-v{VERSION}.json)")
+        raise CaptureError(
+            f"{description}: {printable(where)}: {printable(text)} "
+            f"(schema capture-v{VERSION}.json)"
+        )
+    name = document.get("name", "")
+    if has_controls(name):
+        raise CaptureError(
+            f"{description}: name: expected text without control characters, received "
+            f"{quoted(name)}"
+        )
 
 
 def schema() -> dict[str, Any]:
@@ -97,7 +120,7 @@ def schema() -> dict[str, Any]:
     >>> schema()["properties"]["format"]
     {'const': 'reflfield-capture'}
     """
-    source = files("reflfield.capture").joinpath("schema", "capture-v1.json")
+    source = resources.files("reflfield.capture").joinpath("schema", "capture-v1.json")
     loaded: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
     return loaded
 
@@ -107,38 +130,67 @@ def _validator() -> Any:
     return Draft202012Validator(schema())
 
 
-def _camera(entry: Mapping[str, Any]) -> Camera:
-    return Camera(
-        id=entry["id"],
-        kind=entry.get("model", "opencv"),
-        width=entry["w"],
-        height=entry["h"],
-        fl_x=entry["fl_x"],
-        fl_y=entry["fl_y"],
-        cx=entry["cx"],
-        cy=entry["cy"],
-        distortion=tuple(entry.get(name, 0.0) for name in DISTORTION_NAMES),
-        camera_from_world=np.array(entry["camera_from_world"], dtype=np.float64),
-    )
+def _camera(entry: Mapping[str, Any], description: Path) -> Camera:
+    kind = entry.get("model", "opencv")
+    distortion = tuple(entry.get(name, 0.0) for name in LENS_KEYS)
+    if kind == ORTHOGRAPHIC and any(distortion):
+        raise CaptureError(
+            f"{description}: camera {entry['id']!r}: expected an orthographic camera without "
+            f"distortion, received {distortion}; undistort the photographs first"
+        )
+    try:
+        return Camera(
+            id=entry["id"],
+            kind=kind,
+            width=entry["w"],
+            height=entry["h"],
+            fl_x=entry["fl_x"],
+            fl_y=entry["fl_y"],
+            cx=entry["cx"],
+            cy=entry["cy"],
+            distortion=distortion,
+            camera_from_world=np.array(entry["camera_from_world"], dtype=np.float64),
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{description}: {error}") from error
 
 
-def _light(entry: Mapping[str, Any], root: Path, description: Path) -> Light:
+def _light(entry: Mapping[str, Any], files: NamedFiles) -> Light:
     """A light; the schema has checked which fields each type has."""
     fields = {key: value for key, value in entry.items() if key not in ("type", "irradiance")}
     if entry["type"] == "directional":
         fields["intensity"] = entry["irradiance"]
     if entry["type"] == "environment":
-        fields["file"] = path_inside(root, entry["file"], description)
+        fields["file"] = files.path(entry["file"])
     if "cone_angle" in fields:
         fields.setdefault("falloff_angle", fields["cone_angle"])
-    return Light(kind=entry["type"], **fields)
+    try:
+        return Light(kind=entry["type"], **fields)
+    except CaptureError as error:
+        raise CaptureError(f"{files.description}: {error}") from error
+
+
+def _up(document: Mapping[str, Any], description: Path) -> NDArray[np.float64]:
+    up = np.array(document.get("up", (0.0, 0.0, 1.0)), dtype=np.float64)
+    if not 0 < np.abs(up).max() <= LARGEST_COORDINATE:
+        raise CaptureError(
+            f"{description}: up: expected a direction that is not zero, received {up.tolist()}"
+        )
+    return up
+
+
+def _notes(document: Mapping[str, Any], description: Path) -> tuple[str, ...]:
+    """Keys that the schema allows and nothing reads."""
+    unused = sorted(set(document) - set(schema()["properties"]))
+    listed = ", ".join(quoted(key) for key in unused[:20])
+    return (f"{description}: not used: {listed}",) if unused else ()
 
 
 def _photographs(
     document: Mapping[str, Any],
     cameras: tuple[Camera, ...],
     lights: tuple[Light, ...],
-    description: Path,
+    files: NamedFiles,
 ) -> tuple[Photograph, ...]:
     """Photographs from the list, or every pair of the pattern."""
     listed = document["photographs"]
@@ -146,13 +198,13 @@ def _photographs(
         listed = _expanded(listed["pattern"], cameras, lights)
     view = {camera.id: i for i, camera in enumerate(cameras)}
     light = {light.id: i for i, light in enumerate(lights)}
-    exposures = [_exposures(entry, description) for entry in listed]
-    names = unique_names([e[0].path for e in exposures], description.parent)
+    exposures = [_exposures(entry, files) for entry in listed]
+    names = unique_names([e[0].path for e in exposures], files.root)
     return tuple(
         Photograph(
             name=name,
-            camera=_known(view, entry["camera"], "camera", description),
-            light=_known(light, entry["light"], "light", description),
+            camera=_known(view, entry["camera"], "camera", files),
+            light=_known(light, entry["light"], "light", files),
             exposures=files_of_entry,
         )
         for name, entry, files_of_entry in zip(names, listed, exposures, strict=True)
@@ -173,18 +225,15 @@ def _expanded(
     ]
 
 
-def _exposures(entry: Mapping[str, Any], description: Path) -> tuple[Exposure, ...]:
+def _exposures(entry: Mapping[str, Any], files: NamedFiles) -> tuple[Exposure, ...]:
     listed = entry.get("exposures") or [{"file": entry["file"], "seconds": 1.0}]
-    return tuple(
-        Exposure(path_inside(description.parent, e["file"], description), e["seconds"])
-        for e in listed
-    )
+    return tuple(Exposure(files.path(e["file"]), e["seconds"]) for e in listed)
 
 
-def _known(index: Mapping[str, int], id_: str, what: str, description: Path) -> int:
+def _known(index: Mapping[str, int], id_: str, what: str, files: NamedFiles) -> int:
     if id_ not in index:
         raise CaptureError(
-            f"{description}: photographs: expected the id of a {what} in this file, "
+            f"{files.description}: photographs: expected the id of a {what} in this file, "
             f"received {id_!r}"
         )
     return index[id_]

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from reflfield.capture import lp, middlebury, native, transforms_json
-from reflfield.capture.documents import read_json, read_text
+from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.model import Capture, check_environments, check_pairs, check_photographs
 from reflfield.errors import CaptureError
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class Reader:
     """A way to read captures: the files it recognises by name, and how it reads them."""
 
     pattern: str  # glob, within the capture's folder
-    read: Callable[[Path], Capture]
+    read: Callable[..., Capture]
 
 
 READERS = {
@@ -30,7 +33,12 @@ READERS = {
 
 
 def open_capture(
-    path: Path | str, format: str | None = None, *, require_photographs: bool = True
+    path: Path | str,
+    format: str | None = None,
+    *,
+    require_photographs: bool = True,
+    follow_links: bool = False,
+    test_split: bool = False,
 ) -> Capture:
     """Open a capture, or frames to relight.
 
@@ -43,6 +51,13 @@ def open_capture(
     require_photographs : bool
         Whether every photograph must exist, once per camera and light, in its camera's
         size. False for frames that are only rendered.
+    follow_links : bool
+        Whether symbolic links may lead out of the capture's folder, as those of a download
+        cache do.
+    test_split : bool
+        Whether to add the photographs that the capture's maker keeps for comparison, as
+        ``transforms_test.json`` beside ``transforms_train.json`` does. They are marked
+        (`Photograph.is_test`) and come after the others.
 
     Returns
     -------
@@ -51,7 +66,8 @@ def open_capture(
     Raises
     ------
     CaptureError
-        If there is no description or several, or what it describes cannot be used.
+        If there is no description or several, what it describes cannot be used, or there
+        is no test split to add.
     """
     if format is not None and format not in READERS:
         raise CaptureError(f"format: expected {', '.join(READERS)}, received {format!r}")
@@ -64,12 +80,28 @@ def open_capture(
         description, found = _description_in(path, format)
     else:
         description, found = path, format or _kind_of_file(path)
-    capture = READERS[found].read(description)
+    capture = _read(description, found, follow_links=follow_links, test_split=test_split)
+    for note in capture.notes:
+        _logger.warning("%s", note)
     check_environments(capture)
     if require_photographs:
         check_pairs(capture)
         check_photographs(capture)
     return capture
+
+
+def _read(description: Path, format: str, *, follow_links: bool, test_split: bool) -> Capture:
+    """Read a description of a known format."""
+    if format == "transforms":
+        return transforms_json.read_transforms(
+            description, follow_links=follow_links, test_split=test_split
+        )
+    if test_split:
+        raise CaptureError(
+            f"{description}: expected transforms.json with a test split, received a "
+            f"{format} capture, which has none; hold out views, lights or photographs instead"
+        )
+    return READERS[format].read(description, follow_links=follow_links)
 
 
 def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
@@ -79,8 +111,11 @@ def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
         for name, reader in READERS.items()
         if format in (None, name)
         for file in sorted(folder.glob(reader.pattern))
-        if file.is_file()
+        if not file.is_dir()
     ]
+    train = folder / transforms_json.TRAIN_NAME
+    if not found and format in (None, "transforms") and train.is_file():
+        return train, "transforms"
     if len(found) == 1:
         return found[0]
     wanted = ", ".join(r.pattern for name, r in READERS.items() if format in (None, name))
@@ -99,8 +134,8 @@ def _kind_of_file(path: Path) -> str:
         if "frames" in document:
             return "transforms"
     else:
-        lines = [line for line in text.splitlines() if line.strip()]
-        words = lines[1].split() if len(lines) > 1 and lines[0].strip().isdigit() else []
+        lines = middlebury.uncommented(text)
+        words = lines[1] if len(lines) > 1 and parse_count(" ".join(lines[0])) else []
         if len(words) > middlebury.N_NUMBERS:
             return "middlebury"
         if len(words) > 3:

@@ -248,7 +248,7 @@ def pixel_window(camera: Camera, mesh: Mesh) -> tuple[int, int, int, int]:
     if not np.isfinite(pixels).all():
         return 0, camera.height, 0, camera.width
     margin = 1.0
-    if any(camera.distortion):
+    if not camera.keeps_lines_straight:
         edges = pixels[mesh.faces] - pixels[np.roll(mesh.faces, 1, axis=1)]
         margin += 0.1 * float(np.abs(edges).max(initial=0.0))
     size = np.array([camera.width, camera.height])

@@ -136,7 +136,7 @@ def _removed(
 
 def _test_split(capture: Capture) -> Bools:
     test = np.zeros(len(capture.photographs), bool)
-    test[list(getattr(capture, "test_split", ()))] = True
+    test[capture.test_split] = True
     if not test.any():
         raise InputError(
             f"--hold-out test: expected a capture with a test split (transforms_test.json), "

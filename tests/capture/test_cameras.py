@@ -7,13 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from reflfield.capture.cameras import (
-    Camera,
-    distort,
-    largest_radius,
-    looking_at,
-    undistort,
-)
+from reflfield.capture.cameras import Camera, looking_at
+from reflfield.capture.lenses import distort, largest_radius, undistort
 from reflfield.errors import CaptureError, ShapeError
 
 BARREL = (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02)
@@ -248,7 +243,7 @@ class TestRefused:
             ({"fl_y": -5.0}, "fl_y > 0"),
             ({"width": 0}, "1 x 1 pixels"),
             ({"cx": float("inf")}, "finite intrinsics"),
-            ({"distortion": (0.0,) * 5}, "6 distortion"),
+            ({"distortion": (0.0,) * 9}, "8 distortion"),
             ({"kind": "fisheye"}, "'fisheye'"),
         ],
     )
