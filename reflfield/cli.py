@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import time
@@ -24,6 +25,7 @@ from rich.progress import (
 )
 
 from reflfield import __version__
+from reflfield.capture.names import printable
 from reflfield.errors import InputError, ReflfieldError
 from reflfield.progress import ProgressLines, listening
 
@@ -46,18 +48,36 @@ Format = Annotated[
     str | None,
     typer.Option(help="native, transforms, middlebury or lp; detected by content if absent."),
 ]
+FollowLinks = Annotated[
+    bool,
+    typer.Option("--follow-links", help="Read files that symbolic links lead to elsewhere."),
+]
 Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
 Samples = Annotated[int, typer.Option(help="Rays per pixel, a square number.")]
 
 
 def main() -> None:
     """Entry point: input that cannot be used ends with one message and status 2."""
+    notes, handler = logging.getLogger("reflfield"), Notes()
+    notes.addHandler(handler)
+    notes.propagate = False
     try:
         app()
     except ReflfieldError as error:
         fail(str(error), error)
     except OSError as error:  # a folder that cannot be written, a full disk
         fail(f"{error.filename or 'system'}: {error.strerror or error}", error)
+    finally:
+        notes.removeHandler(handler)
+        notes.propagate = True
+
+
+class Notes(logging.Handler):
+    """Says what the library notes on the way, such as what it does not use of an input."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Say one note."""
+        say_error(f"reflfield: note: {record.getMessage()}")
 
 
 def fail(message: str, error: Exception) -> NoReturn:
@@ -106,13 +126,13 @@ def bars() -> Iterator[None]:
 
 
 def say_error(line: str) -> None:
-    """One line on standard error."""
-    errors.print(line, markup=False, soft_wrap=True)
+    """One line on standard error, with what cannot be printed escaped."""
+    errors.print(printable(line), markup=False, soft_wrap=True)
 
 
 def say(line: str) -> None:
-    """One line of result on standard output."""
-    print(line, flush=True)
+    """One line of result on standard output, with what cannot be printed escaped."""
+    print(printable(line), flush=True)
 
 
 @app.callback(invoke_without_command=True)
@@ -180,6 +200,7 @@ def run(
         typer.Option(metavar="URL", help="Folder or fsspec URL for the texels' samples."),
     ] = None,
     format: Format = None,
+    follow_links: FollowLinks = False,
 ) -> None:
     """Make a relightable field of a capture, with a report.
 
@@ -195,7 +216,7 @@ def run(
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own
         capture, out = capture.resolve(), out.resolve()
-    opened = open_capture(capture, format)
+    opened = open_capture(capture, format, follow_links=follow_links, test_split=held.test)
     with showing_progress(GOES_ON):
         job = run_pipeline(
             opened, out, options, hold_out=held, resources=resources, first=from_, last=until
@@ -242,6 +263,7 @@ def relight(
     ] = None,
     workers: Workers = 0,
     format: Format = None,
+    follow_links: FollowLinks = False,
 ) -> None:
     """Render frames, or a turntable under an environment map or a distant light."""
     from reflfield.field.file import open_field
@@ -259,7 +281,8 @@ def relight(
     opened = open_field(field)
     with showing_progress():
         if frames is not None:
-            made = relight_to(opened, frames, out, options, format)
+            reading = {"format": format, "follow_links": follow_links}
+            made = relight_to(opened, frames, out, options, reading)
         else:
             lights = turntable_lights(opened.up, environment, light, of_map)
             chosen = {"n_frames": orbit, "size": size, "elevation_deg": elevation}
@@ -276,13 +299,13 @@ def refuse_without(needed: str, value: Any, options: dict[str, Any]) -> None:
 
 
 def relight_to(
-    field: Any, frames: Path, out: Path, options: Any, format_: str | None
+    field: Any, frames: Path, out: Path, options: Any, reading: dict[str, Any]
 ) -> list[Path]:
     """Relight frames; their EXR files."""
     from reflfield.capture.readers import open_capture
     from reflfield.relighting.frames import relight_frames
 
-    opened = open_capture(frames, format_, require_photographs=False)
+    opened = open_capture(frames, require_photographs=False, **reading)
     return [frame.exr for frame in relight_frames(field, opened, out, options)]
 
 
@@ -345,6 +368,7 @@ def compare(
     samples: Samples = 16,
     workers: Workers = 0,
     format: Format = None,
+    follow_links: FollowLinks = False,
 ) -> None:
     """Relight frames and measure them against their photographs."""
     from reflfield.capture.readers import open_capture
@@ -356,7 +380,7 @@ def compare(
     opened = open_field(field)
     with showing_progress():
         comparison = write_standalone_comparison(
-            opened, open_capture(frames, format), out, options
+            opened, open_capture(frames, format, follow_links=follow_links), out, options
         )
     say_metrics(comparison.to_dict())
     say(f"metrics   {out / 'metrics.json'}")
@@ -367,6 +391,7 @@ def compare(
 def inspect(
     path: Annotated[Path, typer.Argument(help="A capture or a field.rfld.")],
     format: Format = None,
+    follow_links: FollowLinks = False,
 ) -> None:
     """Say what a capture or a field holds."""
     if path.suffix.lower() == ".rfld":
@@ -378,7 +403,7 @@ def inspect(
         from reflfield.capture.inspect import describe
         from reflfield.capture.readers import open_capture
 
-        lines = describe(open_capture(path, format)).lines()
+        lines = describe(open_capture(path, format, follow_links=follow_links)).lines()
     for line in lines:
         say(line)
 
