@@ -17,8 +17,8 @@ from typing import Any
 from reflfield.capture.model import Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
+from reflfield.folders import only_run
 from reflfield.progress import report
-from reflfield.stages import only_run
 from reflfield.steps import (
     choices,
     evaluation,
@@ -51,6 +51,8 @@ class Stage:
         Digests of what it reads besides.
     wanted : callable
         Whether the job asks for it.
+    intact : callable
+        Says what is wrong with what it has left outside of its folder, if anything.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Stage:
     options: Callable[[PipelineOptions], Any] = lambda options: None
     reads: Callable[[Job], Mapping[str, str]] = lambda job: {}
     wanted: Callable[[Job], bool] = lambda job: True
+    intact: Callable[[Job, Path], str] = lambda job, folder: ""
 
     def run(self, job: Job) -> None:
         """Compute the stage, or take its earlier result."""
@@ -67,7 +70,9 @@ class Stage:
             self.name,
             lambda folder: self.compute(job, folder),
             options=self.options(job.options),
-            inputs={**self.reads(job), **{name: job.stages.key(name) for name in before}},
+            inputs=self.reads(job),
+            after={name: job.stages.key(name) for name in before},
+            intact=lambda folder: self.intact(job, folder),
         )
 
 
@@ -133,6 +138,7 @@ ORDER = (
         reflectance.write_observations,
         after=("visibility",),
         reads=lambda job: {"photographs": job.training.digest(("photographs",))},
+        intact=reflectance.lost_observations,
     ),
     # what is open is settled by trials on the held-out frames
     Stage(

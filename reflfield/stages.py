@@ -5,7 +5,10 @@ options and the keys of the stages it reads, so a folder whose key matches holds
 the stage would compute again. Work goes into ``NAME.partial`` and is renamed when it
 is complete. What a stage that failed or was killed has finished of its blocks
 (`reflfield.scheduling`) is taken up by the next run with the same key; all else of it is
-removed. One run at a time may work in a folder.
+removed.
+
+Beside the record stand checksums of all its files, which are compared before a result is used
+again: what was damaged meanwhile is computed again, saying so.
 
 A stage that is missing here and complete with the same key in another folder is taken over
 from there, by hard links: files of a complete stage are never written again in place, only
@@ -16,13 +19,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
+import logging
 import platform
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -30,24 +32,25 @@ from typing import Any
 
 import psutil
 
+from reflfield.checksums import checksums, first_damaged, is_stamped, stamped
 from reflfield.errors import InputError
-from reflfield.files import replacing
+from reflfield.files import flush_to_disk, naming, replacing
+from reflfield.folders import flush_folder, folder_bytes, link_file, link_folder, remove
 from reflfield.scheduling import Blocks, Scheduler, Tally
 
-try:
-    import fcntl
-except ModuleNotFoundError:  # not on Windows: there, runs are not kept apart
-    fcntl = None  # type: ignore[assignment]
-
+log = logging.getLogger(__name__)
 RECORD = "stage.json"
 KEY = "key"
-LOCK = ".lock"
 # Folders inside a stage's: results of blocks, removed when it is complete, and stores that
 # are written chunk by chunk and stay.
 BLOCKS = "blocks"
 RESTARTABLE = ("samples",)
 # Packages whose version may change what a stage computes.
-NUMERICAL_PACKAGES = ("numpy", "scipy", "numba", "open3d-cpu", "open3d", "xatlas", "zarr")
+NUMERICAL_PACKAGES = (
+    *("numpy", "scipy", "numba", "open3d-cpu", "open3d", "xatlas", "zarr", "trimesh"),
+    *("opencv-contrib-python-headless", "scikit-image", "flip-evaluator", "OpenEXR"),
+    *("OpenImageIO", "rawpy"),
+)
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,9 @@ class StageFolder:
         *,
         options: Any = None,
         inputs: Mapping[str, str] | None = None,
-        revision: int = 1,
+        after: Mapping[str, str] | None = None,
+        code: str = "",
+        intact: Callable[[Path], str] = lambda folder: "",
     ) -> Path:
         """Compute a stage, or take its earlier result.
 
@@ -177,41 +182,52 @@ class StageFolder:
         options : dataclass or plain value
             What the result depends on besides its inputs.
         inputs : mapping of str to str
-            Keys of what is read.
-        revision : int
-            Raised when the code of the stage changes what it computes.
+            Digests of what is read besides the results of other stages.
+        after : mapping of str to str
+            Keys of the stages whose results are read.
+        code : str
+            Digest of the code that computes the stage.
+        intact : callable
+            Says what is wrong with what the stage has left outside of its folder; an empty
+            text if nothing is.
 
         Returns
         -------
         Path
             Folder with the results.
         """
-        key = stage_key(name, options, inputs or {}, revision)
+        inputs, after = dict(inputs or {}), dict(after or {})
+        key = stage_key(name, options, {**inputs, **after}, code)
         folder = self.root / name
-        earlier = None if name in self.redo else _matching_record(folder, key)
+        earlier = None if name in self.redo else _usable_record(folder, key, intact)
         if earlier is not None:
             forget_blocks(folder)
             self.records.append(earlier)
             return folder
         partial = folder.with_name(f"{name}.partial")
-        record = None if name in self.redo else _matching_record(partial, key)
-        record = record or self._taken_over(name, key, partial)
-        if record is None:
-            prepare_partial(partial, key, fresh=name in self.redo)
-            described = {"options": plain(options), "inputs": dict(inputs or {})}
-            record = self._computed(name, key, partial, compute, described)
-        take_place(partial, folder)
+        record = None if name in self.redo else _usable_record(partial, key, intact)
+        record = record or self._taken_over(name, key, partial, intact)
+        with naming(partial):
+            if record is None:
+                prepare_partial(partial, key, fresh=name in self.redo)
+                described = {"options": plain(options), "inputs": inputs, "after": after}
+                record = self._computed(name, key, partial, compute, described)
+            take_place(partial, folder)
         self.records.append(record)
         return folder
 
-    def _taken_over(self, name: str, key: str, partial: Path) -> StageRecord | None:
+    def _taken_over(
+        self, name: str, key: str, partial: Path, intact: Callable[[Path], str]
+    ) -> StageRecord | None:
         """The stage as another folder has it, linked into the unfinished one."""
         for other in self.also:
             run = other.record(name)
-            found = _matching_record(other.root / name, key)
-            if found is not None and (run or name not in self.redo):
+            if name in self.redo and not run:
+                continue
+            record = _usable_record(other.root / name, key, intact)
+            if record is not None:
                 link_stage(other.root / name, partial)
-                return replace(found, reused=run is None or run.reused)
+                return replace(record, reused=run is None or run.reused)
         return None
 
     def _computed(
@@ -246,10 +262,11 @@ class StageFolder:
             blocks_repeated=self.tally.repeated,
             work=self.tally.cpu_seconds,
         )
+        sums = checksums(partial, stores=RESTARTABLE, without=(KEY, BLOCKS, RECORD))
+        flush_folder(partial, without=BLOCKS)
+        text = {**asdict(record), **described, "versions": versions(), "checksums": sums}
         with replacing(partial / RECORD) as unfinished:
-            unfinished.write_text(
-                json.dumps({**asdict(record), **described, "versions": versions()}, indent=1)
-            )
+            unfinished.write_text(json.dumps(stamped(text), indent=1))
         return record
 
     def blocks(self, scheduler: Scheduler, folder: Path) -> Blocks:
@@ -268,9 +285,9 @@ class StageFolder:
         return record.key
 
 
-def stage_key(name: str, options: Any, inputs: Mapping[str, str], revision: int) -> str:
+def stage_key(name: str, options: Any, inputs: Mapping[str, str], code: str) -> str:
     """SHA-256 that changes when anything does that a stage's result depends on."""
-    described = [name, revision, plain(options), dict(sorted(inputs.items())), versions()]
+    described = [name, code, plain(options), dict(sorted(inputs.items())), versions()]
     text = json.dumps(described, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -297,27 +314,40 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _matching_record(folder: Path, key: str) -> StageRecord | None:
+def read_record(folder: Path) -> dict[str, Any]:
+    """What a stage's folder says of itself; empty if it does not, or is damaged."""
     try:
-        found = json.loads((folder / RECORD).read_text())
-    except (OSError, ValueError):
-        return None
-    if not isinstance(found, dict) or found.get("key") != key:
+        text = (folder / RECORD).read_bytes()
+    except FileNotFoundError:
+        return {}
+    try:
+        record = json.loads(text)
+    except (ValueError, RecursionError):
+        record = None
+    if isinstance(record, dict) and is_stamped(record):
+        return record
+    log.warning("%s: damaged; the stage is not used", folder / RECORD)
+    return {}
+
+
+def _usable_record(folder: Path, key: str, intact: Callable[[Path], str]) -> StageRecord | None:
+    """Record of a complete stage with this key whose files are all as they were written."""
+    stored = read_record(folder)
+    if stored.get("key") != key:
         return None
     kept = {
-        entry.name: found[entry.name] for entry in fields(StageRecord) if entry.name in found
+        entry.name: stored[entry.name] for entry in fields(StageRecord) if entry.name in stored
     }
     try:
-        return StageRecord(**{**kept, "reused": True})
-    except TypeError:
+        damaged = first_damaged(folder, stored["checksums"])
+        record = StageRecord(**{**kept, "reused": True})
+    except (TypeError, KeyError, AttributeError):
         return None
-
-
-def folder_bytes(folder: Path, without: str) -> int:
-    """Size of all files below a folder, one of the folders in it left out."""
-    kept = [entry for entry in folder.iterdir() if entry.name != without]
-    files = [path for entry in kept for path in (entry, *entry.rglob("*")) if path.is_file()]
-    return sum(path.stat().st_size for path in files)
+    wrong = f"{folder / damaged}: damaged or gone" if damaged else intact(folder)
+    if wrong:
+        log.warning("%s; the stage %r is computed again", wrong, folder.stem)
+        return None
+    return record
 
 
 def prepare_partial(partial: Path, key: str, *, fresh: bool) -> None:
@@ -370,6 +400,7 @@ def take_place(partial: Path, folder: Path) -> None:
     (folder / RECORD).unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
     partial.rename(folder)
+    flush_to_disk(folder.parent)
     forget_blocks(folder)
 
 
@@ -383,66 +414,7 @@ def link_stage(complete: Path, partial: Path) -> None:
     link_file(complete / RECORD, partial / RECORD)
 
 
-def link_folder(source: Path, target: Path, without: Sequence[str] = ()) -> None:
-    """A second name for every file below a folder; copies where there are no links.
-
-    Parameters
-    ----------
-    source : Path
-        Its files are never written in place again.
-    target : Path
-        Must not exist.
-    without : sequence of str
-        Files and folders in it that are left out.
-    """
-
-    def left_out(folder: str, names: list[str]) -> set[str]:
-        return set(without) & set(names) if Path(folder) == source else set()
-
-    shutil.copytree(source, target, copy_function=link_file, ignore=left_out)
-
-
-def link_file(source: Path | str, target: Path | str) -> None:
-    """A second name for a file; a copy on another file system, or one without links."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-
-
 def forget_blocks(folder: Path) -> None:
     """Remove what a complete stage was put together from."""
     shutil.rmtree(folder / BLOCKS, ignore_errors=True)
     (folder / KEY).unlink(missing_ok=True)
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
-
-
-@contextmanager
-def only_run(root: Path) -> Iterator[None]:
-    """Keep other runs out of a folder while the block runs.
-
-    The system releases the lock when the process ends, however it ends.
-
-    Raises
-    ------
-    InputError
-        If another run holds it.
-    """
-    root.mkdir(parents=True, exist_ok=True)
-    with (root / LOCK).open("w") as lock:
-        if fcntl is not None:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(
-                    f"{root}: expected a folder for this run alone, found another run working "
-                    "in it; wait for it, or choose another folder"
-                ) from None
-        yield

@@ -14,6 +14,8 @@ ROOMS = (
     "errors",
     "checks",
     "files",
+    "folders",
+    "checksums",
     "progress",
     "config",
     "cluster",

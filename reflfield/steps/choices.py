@@ -12,7 +12,8 @@ import numpy as np
 
 from reflfield.errors import InputError
 from reflfield.field.compression import MOST_SAMPLES
-from reflfield.stages import StageFolder, link_folder, plain
+from reflfield.folders import link_folder
+from reflfield.stages import StageFolder, plain
 from reflfield.steps.evaluation import MAIN
 from reflfield.steps.job import AUTO, Job
 from reflfield.steps.options import ComparisonOptions, PipelineOptions

@@ -14,6 +14,7 @@ from reflfield.capture.model import PLANE, Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
 from reflfield.field.indirect import IndirectLight
+from reflfield.files import load_arrays
 from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
@@ -122,7 +123,7 @@ class Job:
     @cached_property
     def view_silhouettes(self) -> list[NDArray[np.float32]]:
         """Coverage of every training view."""
-        stored = load_arrays(self.stages.root / "silhouettes" / "silhouettes.npz")
+        stored = self.result("silhouettes", "silhouettes.npz")
         return [
             stored[f"view{i}"].astype(np.float32) / np.float32(255) for i in range(len(stored))
         ]
@@ -135,7 +136,7 @@ class Job:
     @cached_property
     def surface_atlas(self) -> Atlas:
         """Base surface with texture coordinates."""
-        stored = load_arrays(self.stages.root / "atlas" / "atlas.npz")
+        stored = self.result("atlas", "atlas.npz")
         height, width = (int(n) for n in stored.pop("size"))
         return Atlas(**stored, height=height, width=width)
 
@@ -147,12 +148,12 @@ class Job:
     @cached_property
     def view_seen(self) -> NDArray[np.bool_]:
         """(n_texels, n_views) True where the camera sees the texel."""
-        return load_arrays(self.stages.root / "visibility" / "visibility.npz")["views"]
+        return self.result("visibility", "visibility.npz")["views"]
 
     @cached_property
     def light_seen(self) -> NDArray[np.bool_]:
         """(n_texels, n_lights) True where the light reaches the texel."""
-        return load_arrays(self.stages.root / "visibility" / "visibility.npz")["lights"]
+        return self.result("visibility", "visibility.npz")["lights"]
 
     @property
     def casts_shadows(self) -> bool:
@@ -234,11 +235,11 @@ class Job:
         return np.sort(rng.choice(seen, most, replace=False))
 
     def result(self, stage: str, name: str) -> dict[str, NDArray[Any]]:
-        """Arrays that a stage has written."""
-        return load_arrays(self.stages.root / stage / name)
+        """Arrays that a stage has written.
 
-
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of an npz file; nothing is unpickled."""
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+        Raises
+        ------
+        InputError
+            If the file is damaged, or holds more than the memory.
+        """
+        return load_arrays(self.stages.root / stage / name, self.resources.max_memory)

@@ -18,7 +18,7 @@ from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
 from reflfield.progress import track
 from reflfield.steps.evaluation import MAIN, frame_sets, variants, within_memory
-from reflfield.steps.job import Job, load_arrays
+from reflfield.steps.job import Job
 from reflfield.steps.quantising import FieldMaker
 
 # Steps over the residual of the fit.
@@ -51,7 +51,7 @@ def stored_points(job: Job) -> list[RatePoint]:
 
 def stored_model(job: Job, stage: str) -> tuple[ClusteredModel, NDArray[np.float32]]:
     """Model of a compression stage before it was quantised, and its frames."""
-    arrays: dict[str, Any] = load_arrays(job.stages.root / stage / "model.npz")
+    arrays: dict[str, Any] = job.result(stage, "model.npz")
     frames = arrays.pop("local_from_world")
     residuals = tuple(arrays.pop("residuals").tolist())
     return ClusteredModel(**arrays, residuals=residuals), frames

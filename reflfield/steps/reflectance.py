@@ -21,6 +21,7 @@ from reflfield.alignment.scattered import (
 from reflfield.alignment.splines import NodeTargets
 from reflfield.comparison.residual import sample_error
 from reflfield.config import Resources
+from reflfield.errors import InputError
 from reflfield.factorization import Completion, complete
 from reflfield.field.compression import (
     CompressionOptions,
@@ -32,13 +33,14 @@ from reflfield.field.fit import (
 from reflfield.observations.projection import Projection, project_photographs
 from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot
+from reflfield.observations.store import open_samples
 from reflfield.scheduling import Blocks
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain
 from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
 from reflfield.steps.fitting import AlignedFrames, Resampled, fitted_model, local_frames
-from reflfield.steps.job import Job
+from reflfield.steps.job import ELSEWHERE, Job
 from reflfield.steps.memory import columns_at_once, writers_at_once
 from reflfield.steps.options import AlignmentOptions
 from reflfield.steps.quantising import FieldMaker
@@ -67,6 +69,20 @@ def write_observations(job: Job, folder: Path) -> dict[str, Any]:
         "samples": n_samples,
         "raw bytes": n_samples * 6,
     }
+
+
+def lost_observations(job: Job, folder: Path) -> str:
+    """What is wrong with the samples in a store elsewhere; empty if nothing is.
+
+    Its chunks are verified as they are read.
+    """
+    if not (folder / ELSEWHERE).is_file():
+        return ""
+    try:
+        open_samples((folder / ELSEWHERE).read_text(), "r")
+    except InputError as error:
+        return str(error).partition("; ")[0]
+    return ""
 
 
 def write_completion(job: Job, folder: Path) -> dict[str, Any]:

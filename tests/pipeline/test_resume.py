@@ -128,14 +128,17 @@ def test_an_unreadable_record_is_computed_again(run_copy, run_tiny):
         assert "unchanged" not in outcome.out.splitlines()[1]
 
 
-def test_a_record_of_an_earlier_version_lacks_what_is_counted_since(run_copy, run_tiny):
+def test_a_record_that_was_changed_is_computed_again(run_copy, run_tiny):
     path = run_copy / "stages" / "hull" / "stage.json"
     record = json.loads(path.read_text())
-    for missing, unchanged in (("blocks_repeated", True), ("seconds", False)):
-        path.write_text(json.dumps({k: v for k, v in record.items() if k != missing}))
+    changed = {**record, "counts": {**record["counts"], "triangles": 7}}
+    lacking = {k: v for k, v in record.items() if k != "seconds"}
+    for text in (changed, lacking):
+        path.write_text(json.dumps(text))
         outcome = run_tiny(run_copy, "--until", "hull")
         assert outcome.status == 0
-        assert ("unchanged" in outcome.out.splitlines()[1]) == unchanged
+        assert "unchanged" not in outcome.out.splitlines()[1]
+        assert json.loads(path.read_text())["counts"] == record["counts"]
 
 
 def test_nothing_is_left_of_a_chunk_whose_writer_was_killed(tmp_path):

@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 
+from reflfield.observations.store import create_samples
 from reflfield.stages import RECORD, StageFolder
 
 OPTIONS = {"side": 5}
@@ -116,6 +117,91 @@ def test_killed_before_it_takes_its_place_it_is_whole(folder, other, monkeypatch
             folder.run("sum", refused, options=OPTIONS)
     again = StageFolder(folder.root)
     assert contents(again.run("sum", refused, options=OPTIONS)) == contents(other.root / "sum")
+
+
+def flipped(path):
+    """A file with one bit changed, as old as before."""
+    data, status = bytearray(path.read_bytes()), path.stat()
+    data[len(data) // 2] ^= 16
+    path.write_bytes(data)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+DAMAGES = {
+    "one bit": flipped,
+    "cut off": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "empty": lambda path: path.write_bytes(b""),
+    "gone": lambda path: path.unlink(),
+    "longer": lambda path: path.write_bytes(path.read_bytes() + b"0"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+@pytest.mark.parametrize("name", ["sum.txt", "samples/blocks"])
+def test_a_damaged_file_is_computed_again_and_said(other, caplog, damage, name):
+    damage(other.root / "sum" / name)
+    made = other.run("sum", write_sum, options=OPTIONS)
+    assert not other.records[0].reused
+    assert (made / "sum.txt").read_text() == "6"
+    assert f"{made / name}: damaged or gone; the stage 'sum' is computed again" in caplog.text
+    # Another run takes it as it is now.
+    assert StageFolder(other.root).run("sum", refused, options=OPTIONS) == made
+
+
+def test_a_damaged_record_is_computed_again_and_said(other, caplog):
+    for damage in DAMAGES.values():
+        damage(other.root / "sum" / RECORD)
+        stages = StageFolder(other.root)
+        stages.run("sum", write_sum, options=OPTIONS)
+        assert not stages.records[0].reused
+    assert caplog.text.count("stage.json: damaged") == len(DAMAGES) - 1  # one was gone
+
+
+def test_a_damaged_stage_is_not_taken_over(folder, other, caplog):
+    flipped(other.root / "sum" / "sum.txt")
+    made = folder.run("sum", write_sum, options=OPTIONS)
+    assert (made / "sum.txt").read_text() == "6"
+    assert not (made / "sum.txt").samefile(other.root / "sum" / "sum.txt")
+    assert "sum.txt: damaged or gone" in caplog.text
+
+
+def test_what_is_wrong_outside_of_the_folder_is_computed_again(other, caplog):
+    wrong = lambda folder: "s3://bucket/x: gone"  # noqa: E731
+    other.run("sum", write_sum, options=OPTIONS, intact=wrong)
+    assert not other.records[0].reused
+    assert "s3://bucket/x: gone; the stage 'sum' is computed again" in caplog.text
+
+
+def write_store(folder):
+    """A stage with a store of two chunks."""
+    array = create_samples(folder / "samples", 5, 2, 2)
+    array[:] = 3
+    return {}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_chunk_is_computed_again(tmp_path, caplog, damage):
+    stages = StageFolder(tmp_path)
+    folder = stages.run("observations", write_store)
+    chunk = folder / "samples" / "c" / "0" / "0" / "0" / "0"
+    if damage == "one bit":  # written now, as whatever damages it would
+        data = bytearray(chunk.read_bytes())
+        data[-9] ^= 1
+        chunk.write_bytes(data)
+    else:
+        DAMAGES[damage](chunk)
+    again = StageFolder(tmp_path)
+    again.run("observations", write_store)
+    assert not again.records[0].reused
+    assert "samples/c" in caplog.text
+    assert (create_samples(folder / "samples", 5, 2, 2)[:] == 3).all()
+    StageFolder(tmp_path).run("observations", refused)
+
+
+def test_a_store_that_was_copied_is_verified_and_used(tmp_path):
+    StageFolder(tmp_path / "first").run("observations", write_store)
+    shutil.copytree(tmp_path / "first", tmp_path / "second", copy_function=shutil.copyfile)
+    StageFolder(tmp_path / "second").run("observations", refused)
 
 
 def test_an_unfinished_stage_is_not_taken_over(folder, other):
