@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.images import write_png
+from reflfield.capture.image_writing import write_png
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
 from reflfield.config import read_toml, with_tables

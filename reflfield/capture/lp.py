@@ -18,7 +18,7 @@ import numpy as np
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
-from reflfield.capture.images import image_size
+from reflfield.capture.image_files import image_size
 from reflfield.capture.lights import LARGEST_COORDINATE, Light
 from reflfield.capture.model import PLANE, Capture, Exposure, Photograph
 from reflfield.capture.names import printable, quoted, unique_names

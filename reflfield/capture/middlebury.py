@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera, not_rigid_because
 from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
-from reflfield.capture.images import image_size
+from reflfield.capture.image_files import image_size
 from reflfield.capture.lights import LARGEST_COORDINATE, Light
 from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.names import frame_name, printable, quoted, unique_names

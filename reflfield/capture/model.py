@@ -13,14 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.images import (
+from reflfield.capture.exposures import merge_exposures
+from reflfield.capture.image_files import (
+    AS_STATED,
+    ImageReading,
+    image_orientation,
     image_size,
-    measured_exposures,
-    merge_exposures,
+    read_alpha,
     read_coverage,
     read_exposure,
     read_image,
     read_measured,
+    stores_alpha,
 )
 from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.silhouettes import silhouette_from_photographs
@@ -36,10 +40,20 @@ DIGEST_PARTS = ("cameras", "lights", "silhouettes", "photographs")
 
 @dataclass(frozen=True)
 class Exposure:
-    """One file of a photograph; `seconds` is given where exposures are bracketed."""
+    """One file of a photograph.
+
+    Parameters
+    ----------
+    path : Path
+    seconds : float
+        Exposure time, where exposures are bracketed.
+    reading : ImageReading
+        Encoding, layer and white level, where the file does not say them.
+    """
 
     path: Path
     seconds: float = 1.0
+    reading: ImageReading = AS_STATED
 
 
 @dataclass(frozen=True)
@@ -72,18 +86,27 @@ class Photograph:
     def read(self) -> NDArray[np.float32]:
         """Linear radiance, (h, w, 3) float32; bracketed exposures are merged."""
         if len(self.exposures) == 1:
-            return read_image(self.path) / np.float32(self.exposures[0].seconds)
-        images = [read_exposure(e.path) for e in self.exposures]
-        return merge_exposures(images, [e.seconds for e in self.exposures])
+            first = self.exposures[0]
+            return read_image(first.path, first.reading) / np.float32(first.seconds)
+        return self.read_measured()[0]
 
     def read_measured(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Radiance and which of its values are measurements (`Capture.read_measured`)."""
         if len(self.exposures) == 1:
-            image, measured = read_measured(self.path)
-            return image / np.float32(self.exposures[0].seconds), measured
-        images = [read_exposure(e.path) for e in self.exposures]
+            first = self.exposures[0]
+            image, measured = read_measured(first.path, first.reading)
+            return image / np.float32(first.seconds), measured
+        read = [read_exposure(e.path, e.reading) for e in self.exposures]
         seconds = [e.seconds for e in self.exposures]
-        return merge_exposures(images, seconds), measured_exposures(images)
+        merged = merge_exposures(
+            [image for image, _, _ in read], seconds, [encoding for _, _, encoding in read]
+        )
+        return merged, np.logical_or.reduce([measured for _, measured, _ in read])
+
+    def read_alpha(self) -> NDArray[np.float32] | None:
+        """Alpha of the first file, (h, w) float32; None if it has none or is opaque."""
+        first = self.exposures[0]
+        return read_alpha(first.path, first.reading)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,8 +246,10 @@ class Capture:
     def read_silhouette(self, view: int) -> NDArray[np.float32]:
         """Coverage of view `view` in [0, 1], (h, w) float32.
 
-        Read where a file is given, the whole image where the base geometry is the image
-        plane, else made from the view's photographs (`capture.silhouettes`).
+        Read where a file is given; else the alpha of the view's photographs, where they have
+        one that is not opaque (pixel by pixel the median over at most `SILHOUETTE_SAMPLE` of
+        them, so that one bad matte does no harm); else the whole image where the base geometry
+        is the image plane; else made from the view's photographs (`capture.silhouettes`).
 
         Raises
         ------
@@ -232,18 +257,36 @@ class Capture:
             If the file cannot be used, or no object is found.
         """
         camera, path = self.cameras[view], self.silhouettes[view]
-        if path is None and self.base_geometry == PLANE:
+        coverage = read_coverage(path) if path is not None else self.read_alpha(view)
+        if coverage is None and self.base_geometry == PLANE:
             return np.ones((camera.height, camera.width), dtype=np.float32)
-        if path is None:
+        if coverage is None:
             return _made_silhouette(self, view)
-        coverage = read_coverage(path)
-        _check_matches(path, camera, coverage.shape[1], coverage.shape[0])
+        what = path if path is not None else f"alpha of the photographs of {camera.id!r}"
+        _check_matches(what, camera, coverage.shape[1], coverage.shape[0])
         if not (coverage > 0.5).any():
             raise CaptureError(
-                f"{path}: empty silhouette: no pixel of view {camera.id!r} is covered; "
-                "white must mean object"
+                f"{what}: empty silhouette: no pixel of view {camera.id!r} is covered, the "
+                f"largest value is {_in_codes(float(coverage.max()))}; white must mean object"
             )
         return coverage
+
+    def read_alpha(self, view: int) -> NDArray[np.float32] | None:
+        """Combined alpha of the photographs of a view, (h, w) float32; None if there is none.
+
+        Photographs without alpha, and those that are opaque everywhere, are left out.
+        """
+        alphas = [self.photographs[i].read_alpha() for i in self._with_alpha(view)]
+        shown = [alpha for alpha in alphas if alpha is not None]
+        return np.median(shown, axis=0).astype(np.float32) if shown else None
+
+    def _with_alpha(self, view: int) -> list[int]:
+        """Photographs of a view that are asked for their alpha, evenly spread."""
+        return [
+            i
+            for i in _sampled(self, view)
+            if stores_alpha(self.photographs[i].path, self.photographs[i].exposures[0].reading)
+        ]
 
     def subset(
         self, views: ArrayLike | None = None, lights: ArrayLike | None = None
@@ -307,18 +350,23 @@ class Capture:
             yield from (_file_digest(light.file) for light in self.lights if light.file)
         elif part == "silhouettes":
             for view, path in enumerate(self.silhouettes):
-                files = [path] if path is not None else self._silhouette_sources(view)
-                yield from (_file_digest(p) for p in files)
+                if path is not None:
+                    yield _file_digest(path)
+                else:
+                    yield from self._silhouette_sources(view)
         else:
             for photograph in self.photographs:
                 yield f"{photograph.name} {photograph.camera} {photograph.light}".encode()
                 for exposure in photograph.exposures:
-                    yield str(exposure.seconds).encode() + _file_digest(exposure.path)
+                    yield f"{exposure.seconds} {exposure.reading}".encode()
+                    yield _file_digest(exposure.path)
 
-    def _silhouette_sources(self, view: int) -> list[Path]:
-        if self.base_geometry == PLANE:
-            return []
-        return [e.path for p in self.photographs if p.camera == view for e in p.exposures]
+    def _silhouette_sources(self, view: int) -> Iterator[bytes]:
+        """Bytes that stand for the photographs that a silhouette is made from."""
+        of_view = [i for i, p in enumerate(self.photographs) if p.camera == view]
+        for i in self._with_alpha(view) if self.base_geometry == PLANE else of_view:
+            for exposure in self.photographs[i].exposures:
+                yield str(exposure.reading).encode() + _file_digest(exposure.path)
 
 
 def usual_base_geometry(n_views: int) -> str:
@@ -352,7 +400,9 @@ def check_photographs(capture: Capture) -> None:
     for photograph in capture.photographs:
         camera = capture.cameras[photograph.camera]
         for exposure in photograph.exposures:
-            _check_matches(exposure.path, camera, *image_size(exposure.path))
+            size = image_size(exposure.path, exposure.reading)
+            _check_matches(exposure.path, camera, *size)
+    _check_orientations(capture)
     for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
         if path is not None:
             _check_matches(path, camera, *image_size(path))
@@ -394,12 +444,37 @@ def check_pairs(capture: Capture) -> None:
 
 
 def _made_silhouette(capture: Capture, view: int) -> NDArray[np.float32]:
-    indices = [i for i, p in enumerate(capture.photographs) if p.camera == view]
-    step = -(-len(indices) // SILHOUETTE_SAMPLE) or 1
     return silhouette_from_photographs(
-        (capture.read_photograph(i) for i in indices[::step]),
+        (capture.read_photograph(i) for i in _sampled(capture, view)),
         name=f"view {capture.cameras[view].id!r}",
     )
+
+
+def _sampled(capture: Capture, view: int) -> list[int]:
+    """At most `SILHOUETTE_SAMPLE` photographs of a view, evenly spread."""
+    indices = [i for i, p in enumerate(capture.photographs) if p.camera == view]
+    step = -(-len(indices) // SILHOUETTE_SAMPLE) or 1
+    return indices[::step]
+
+
+def _check_orientations(capture: Capture) -> None:
+    """Demand that no camera has photographs that a viewer would turn differently."""
+    first: dict[int, tuple[int, Path]] = {}
+    for photograph in capture.photographs:
+        for exposure in photograph.exposures:
+            turn = image_orientation(exposure.path)
+            known, path = first.setdefault(photograph.camera, (turn, exposure.path))
+            if turn != known:
+                raise CaptureError(
+                    f"{exposure.path}: expected Exif orientation {known} as {path.name} of the "
+                    f"same camera {capture.cameras[photograph.camera].id!r} has, received "
+                    f"{turn}; pixels are read as stored, so turn the files alike and remove "
+                    "the entry"
+                )
+
+
+def _in_codes(value: float) -> str:
+    return f"{round(255 * value)} of 255"
 
 
 def _check_indices(photograph: Photograph, n_views: int, n_lights: int) -> None:
@@ -419,7 +494,7 @@ def _check_unique(what: str, ids: Sequence[str]) -> None:
         seen.add(id_)
 
 
-def _check_matches(path: Path, camera: Camera, width: int, height: int) -> None:
+def _check_matches(path: Path | str, camera: Camera, width: int, height: int) -> None:
     if (width, height) != (camera.width, camera.height):
         raise CaptureError(
             f"{path}: image size: expected {camera.width} x {camera.height} pixels as camera "

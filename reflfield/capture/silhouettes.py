@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.images import encode_srgb
+from reflfield.capture.encoding import encode_srgb
 from reflfield.checks import check_shape
 from reflfield.errors import CaptureError, InputError
 

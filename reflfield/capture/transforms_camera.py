@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import FISHEYE, OPENCV, Camera, not_rigid_because
 from reflfield.capture.documents import number, number_array
-from reflfield.capture.images import image_size
+from reflfield.capture.image_files import image_size
 from reflfield.capture.names import quoted
 from reflfield.capture.transforms_frame import LENS_KEYS, Frame
 from reflfield.errors import CaptureError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reflfield.capture.images import read_image
+from reflfield.capture.image_files import read_image
 from reflfield.capture.model import Capture
 from reflfield.comparison.metrics import Comparison, FramePair, compare_frames
 from reflfield.field.model import ReflectanceField

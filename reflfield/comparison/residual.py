@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.images import encode_srgb
+from reflfield.capture.encoding import encode_srgb
 from reflfield.comparison.metrics import psnr
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.capture.images import encode_srgb
+from reflfield.capture.encoding import encode_srgb
 
 # Rec. 709: the weights of the colour space that all radiance is stored in.
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)

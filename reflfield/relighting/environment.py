@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.capture.images import image_size, read_image
+from reflfield.capture.image_files import image_size, read_image
 from reflfield.capture.lights import CONVENTIONS, Light
 from reflfield.checks import check_shape, not_a_rotation_because
 from reflfield.errors import InputError
@@ -121,7 +121,7 @@ class EnvironmentMap:
         """
         width, height = image_size(path)
         check_latlong(str(path), width, height)
-        radiance = read_image(path)
+        radiance = read_image(path, what="environment map")
         _check_radiance(str(path), radiance)
         _tell_of_oddities(path, radiance)
         rotation = None

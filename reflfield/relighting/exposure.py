@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.images import encode_srgb
+from reflfield.capture.encoding import encode_srgb
 from reflfield.errors import InputError
 
 # Rec.709 luminance of linear Rec.709 primaries.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reflfield.capture.images import read_image, write_exr, write_png
+from reflfield.capture.image_files import read_image
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.model import Capture
 from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField

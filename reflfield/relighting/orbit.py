@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from reflfield.capture.cameras import OPENCV, Camera, looking_at
-from reflfield.capture.images import atomic_path, write_png
+from reflfield.capture.image_writing import write_png
 from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField
+from reflfield.files import replacing
 from reflfield.progress import track
 from reflfield.relighting.exposure import common_exposure, covered_luminances, encoded_picture
 from reflfield.relighting.renderer import Lighting, Renderer, RenderOptions
@@ -216,7 +217,7 @@ def write_animation(
         Speed.
     """
     first, *others = (Image.fromarray(picture) for picture in pictures)
-    with atomic_path(path) as temporary:
+    with replacing(Path(path)) as temporary:
         first.save(
             temporary,
             format="WEBP",

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.images import encode_srgb, write_exr
+from reflfield.capture.encoding import encode_srgb
+from reflfield.capture.image_writing import write_exr
 from reflfield.comparison import sections
 from reflfield.comparison.heldout import RelitPairs, mean_sample
 from reflfield.comparison.metrics import Comparison, compare_frames

@@ -6,7 +6,8 @@ import pytest
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.clipping import measured_values
-from reflfield.capture.images import encode_srgb, write_exr, write_png
+from reflfield.capture.encoding import encode_srgb
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph
 

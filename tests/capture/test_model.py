@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.images import write_exr, write_png
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.inspect import describe, largest_gap, object_centre
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from reflfield.capture import documents
-from reflfield.capture.images import encode_srgb, write_exr, write_png
+from reflfield.capture.encoding import encode_srgb
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.native import schema
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError

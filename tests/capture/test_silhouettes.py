@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reflfield.capture.images import decode_srgb
+from reflfield.capture.encoding import decode_srgb
 from reflfield.capture.readers import open_capture
 from reflfield.capture.silhouettes import SilhouetteOptions, silhouette_from_photographs
 from reflfield.errors import CaptureError, InputError

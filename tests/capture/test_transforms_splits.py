@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from reflfield.capture.images import write_exr
+from reflfield.capture.image_writing import write_exr
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError
 

@@ -154,7 +154,7 @@ def test_noise_variance_against_photon_count(rng, electrons):
 
 def test_merged_exposures_recover_radiance_within_the_predicted_variance(rng):
     """Maximum likelihood from several exposures: variances add as 1 / sum(1 / variance)."""
-    from reflfield.capture.images import merge_exposures
+    from reflfield.capture.exposures import merge_exposures
 
     seconds = (0.25, 1.0, 4.0)
     noise = {"electrons_per_radiance": 2e4, "read_noise": 2.0}

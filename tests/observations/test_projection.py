@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.images import write_exr
+from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph
 from reflfield.errors import InputError, ShapeError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reflfield.capture.images import encode_srgb
+from reflfield.capture.encoding import encode_srgb
 from reflfield.comparison.residual import sample_error
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reflfield.capture.images import read_image, write_exr
+from reflfield.capture.image_files import read_image
+from reflfield.capture.image_writing import write_exr
 
 
 @pytest.fixture

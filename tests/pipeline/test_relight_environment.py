@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reflfield.capture.images import write_exr
+from reflfield.capture.image_writing import write_exr
 from reflfield.field.file import write_field
 from reflfield.field.synthetic import baked_field, lambert, sphere_surface
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from reflfield.capture.images import read_image
+from reflfield.capture.image_files import read_image
 from reflfield.config import merged
 from reflfield.field.evaluation import evaluate
 from reflfield.field.file import open_field

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.capture.images import write_exr
+from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError, InputError, ShapeError

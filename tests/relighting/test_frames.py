@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reflfield.capture.images import read_coverage, read_image
+from reflfield.capture.image_files import read_coverage, read_image
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph
 from reflfield.errors import InputError

@@ -1,0 +1,280 @@
+"""Image files as linear float32: EXR, PNG, JPEG, TIFF, Radiance HDR and camera raw.
+
+What a file states about its colour is honoured or refused (`capture.stated_color`); integers
+that state nothing are sRGB, floats are linear. Pixels stay as stored: a calibration speaks of
+those, so Exif orientation turns nothing.
+
+A photograph whose alpha is not 1 everywhere shows the object before black: colour times alpha.
+EXR and float TIFF have it multiplied already, by convention; PNG has not; TIFF says. Below
+alpha 0 everything is black, whatever the file holds there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.clipping import measured_values
+from reflfield.capture.color_spaces import ColorSpace
+from reflfield.capture.decoding import StoredImage, decode_stored, raw_size
+from reflfield.capture.encoding import Encoding, encode_srgb
+from reflfield.capture.image_headers import read_header
+from reflfield.capture.image_layers import choose_layer
+from reflfield.errors import CaptureError
+
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ImageReading:
+    """What somebody says about image files that the files do not say themselves.
+
+    Parameters
+    ----------
+    encoding : Encoding, optional
+        Curve from stored to linear values. It replaces what the file states about its colour;
+        primaries then count as Rec.709's.
+    layer : str, optional
+        Layer, part or page that is the photograph (`capture.image_layers`).
+    white_level : float, optional
+        Stored value from which on the sensor is saturated: a code of integer files, a value of
+        others (`capture.clipping`).
+    """
+
+    encoding: Encoding | None = None
+    layer: str | None = None
+    white_level: float | None = None
+
+
+AS_STATED = ImageReading()
+
+
+def read_image(
+    path: Path | str, reading: ImageReading = AS_STATED, *, what: str = "photograph"
+) -> Float32:
+    """Read an image as linear RGB.
+
+    Parameters
+    ----------
+    path : Path or str
+        EXR, PNG, JPEG, TIFF, Radiance HDR or camera raw, told apart by content.
+    reading : ImageReading, optional
+        Encoding and layer, where the file does not say them.
+    what : str
+        What the image is called in messages.
+
+    Returns
+    -------
+    (height, width, 3) float32
+        Linear, primaries of Rec.709, before black where there is alpha; grey is repeated.
+
+    Raises
+    ------
+    CaptureError
+        If the file is missing, truncated, of another kind, too large, states colour that is
+        not understood, leaves open which layer is meant, or holds NaN or infinity. The message
+        names the file.
+    """
+    path = Path(path)
+    stored = _read(path, reading)
+    return _linear(path, stored, reading, what)
+
+
+def read_measured(
+    path: Path | str, reading: ImageReading = AS_STATED, *, what: str = "photograph"
+) -> tuple[Float32, Bool]:
+    """Read an image as linear RGB, and which of its values are measurements.
+
+    Parameters
+    ----------
+    path, reading, what
+        As `read_image`.
+
+    Returns
+    -------
+    image : (h, w, 3) float32
+        As `read_image`.
+    measured : (h, w, 3) bool
+        False where a value is at a limit of the sensor or the file (`capture.clipping`), beyond
+        the last pair of a table, or under alpha 0.
+    """
+    path = Path(path)
+    stored = _read(path, reading)
+    image = _linear(path, stored, reading, what)
+    return image, np.broadcast_to(_measured(stored, reading), image.shape)
+
+
+def read_exposure(
+    path: Path | str, reading: ImageReading = AS_STATED
+) -> tuple[Float32, Bool, Encoding]:
+    """Read one of several bracketed exposures as stored: 1 is where it saturates.
+
+    A file of floats is taken as linear up to the sensor's saturation at its white level (1 if
+    none is said), and encoded in sRGB.
+
+    Returns
+    -------
+    encoded : (h, w, 3) float32
+        In [0, 1].
+    measured : (h, w, 3) bool
+        As `read_measured`.
+    encoding : Encoding
+        From encoded to linear values.
+    """
+    path = Path(path)
+    stored = _read(path, reading)
+    image = _linear(path, stored, reading, "photograph")
+    measured = _measured(stored, reading)
+    encoding = (reading.encoding or stored.space.encoding) if stored.integer else None
+    if encoding is None or stored.alpha is not None or stored.space.matrix is not None:
+        white = 1.0 if stored.integer else reading.white_level or 1.0
+        values = encode_srgb(image / np.float32(white)).astype(np.float32)
+        measured = measured & (values > 0) & (values < 1)
+        return values, measured, Encoding("srgb")
+    shape = image.shape
+    return np.broadcast_to(stored.values, shape), np.broadcast_to(measured, shape), encoding
+
+
+def read_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> Float32 | None:
+    """Alpha of a photograph, (h, w) float32 in [0, 1]; None if it has none or is opaque."""
+    alpha = _read(Path(path), reading).alpha
+    return None if alpha is None or not (alpha < 1).any() else alpha
+
+
+def stores_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> bool:
+    """Whether a file has an alpha channel, by its header; it may be opaque."""
+    path = Path(path)
+    header = read_header(path)
+    if header.kind == "exr":
+        return bool(choose_layer(path, header, reading.layer).alpha)
+    return header.alpha
+
+
+def read_coverage(path: Path | str) -> Float32:
+    """Read a silhouette: the fraction of each pixel that the object covers.
+
+    Parameters
+    ----------
+    path : Path or str
+        Grey (white = object); of an image with an alpha channel that is not opaque everywhere,
+        alpha is taken. Stored values count, whatever encoding the file states.
+
+    Returns
+    -------
+    (height, width) float32
+        Coverage in [0, 1].
+
+    Raises
+    ------
+    CaptureError
+        As `read_image`.
+    """
+    path = Path(path)
+    stored = _read(path, AS_STATED)
+    if stored.alpha is not None and (stored.alpha < 1).any():
+        _check_finite(path, stored.alpha, "silhouette")
+        return stored.alpha
+    coverage = stored.values.mean(axis=2, dtype=np.float32)
+    _check_finite(path, coverage, "silhouette")
+    return np.clip(coverage, 0, 1)
+
+
+def image_size(path: Path | str, reading: ImageReading = AS_STATED) -> tuple[int, int]:
+    """(width, height) from the header alone, nothing decoded.
+
+    Raises
+    ------
+    CaptureError
+        If the file is missing or not an image this package reads.
+    """
+    path = Path(path)
+    header = read_header(path)
+    if header.kind == "raw":
+        return raw_size(path, header)
+    layer = choose_layer(path, header, reading.layer)
+    return layer.width, layer.height
+
+
+def image_orientation(path: Path | str) -> int:
+    """How a viewer would turn an image by its Exif data, 1 (not at all) to 8."""
+    return read_header(Path(path)).orientation
+
+
+def _read(path: Path, reading: ImageReading) -> StoredImage:
+    header = read_header(path)
+    return decode_stored(path, header, choose_layer(path, header, reading.layer))
+
+
+def _space(stored: StoredImage, reading: ImageReading) -> ColorSpace:
+    return stored.space if reading.encoding is None else ColorSpace(reading.encoding)
+
+
+def _linear(path: Path, stored: StoredImage, reading: ImageReading, what: str) -> Float32:
+    """Linear RGB, before black where there is alpha."""
+    space = _space(stored, reading)
+    alpha = stored.alpha
+    if alpha is not None and not (alpha < 1).any():
+        alpha = None
+    if alpha is not None and not (alpha > 0).any() and stored.colour.any():
+        raise CaptureError(
+            f"{path}: expected an alpha that leaves something to see, received 0 everywhere; "
+            "remove the channel"
+        )
+    if alpha is None:
+        linear = _decoded(stored, space)
+    elif not stored.premultiplied:
+        linear = _decoded(stored, space) * alpha[..., None]
+    elif stored.integer:  # multiplied after encoding
+        shares = np.maximum(alpha, np.float32(1e-6))[..., None]
+        values = np.clip(stored.values / shares, 0, 1).astype(np.float32)
+        linear = space.linear(_three_channels(values)) * alpha[..., None]
+    else:
+        linear = _decoded(stored, space) * (alpha > 0)[..., None]
+    _check_finite(path, linear, what)
+    return np.ascontiguousarray(linear, np.float32)
+
+
+def _decoded(stored: StoredImage, space: ColorSpace) -> Float32:
+    """Linear RGB of stored colour; codes are looked up in a table of all there are."""
+    top = stored.largest_code
+    if top == 1 or stored.colour.size < top:
+        return space.linear(_three_channels(stored.values))
+    table = space.encoding.decode(np.arange(top + 1, dtype=np.float32) / np.float32(top))
+    linear = _three_channels(table[stored.colour])
+    return (
+        linear
+        if space.matrix is None
+        else ColorSpace(Encoding("linear"), space.matrix).linear(linear)
+    )
+
+
+def _measured(stored: StoredImage, reading: ImageReading) -> Bool:
+    """(h, w, 1 or 3): which stored values are no limits."""
+    values = stored.values
+    level = reading.white_level
+    if level is not None:
+        level /= stored.largest_code
+    measured = measured_values(values, integer=stored.integer, white_level=level)
+    measured &= values <= np.float32(_space(stored, reading).encoding.top)
+    if stored.alpha is not None:
+        measured &= stored.alpha[..., None] > 0
+    return measured
+
+
+def _three_channels(values: Float32) -> Float32:
+    return values if values.shape[2] == 3 else values.repeat(3, axis=2)
+
+
+def _check_finite(path: Path, image: Float32, what: str) -> None:
+    if np.isfinite(image).all():
+        return
+    bad = ~np.isfinite(image.reshape(*image.shape[:2], -1)).all(axis=2)
+    row, column = np.argwhere(bad)[0]
+    raise CaptureError(
+        f"{path}: expected finite values, received {int(bad.sum())} pixels with NaN or "
+        f"infinity, first at row {row}, column {column}; repair or drop this {what}"
+    )
