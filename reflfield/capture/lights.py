@@ -137,6 +137,14 @@ class Light:
         """Whether the light's direction was measured."""
         return self.kind != UNKNOWN
 
+    @property
+    def shines(self) -> bool:
+        """Whether anything is lit: True for an environment and for an unknown light."""
+        numbered = (POINT, SPOT, DIRECTIONAL)
+        return any(
+            s.kind not in numbered or bool((s.intensity > 0).any()) for s in self.sources
+        )
+
     def directions(self, points: ArrayLike) -> Array:
         """Unit directions (n, 3) from world points (n, 3) to the light.
 

@@ -423,26 +423,6 @@ def check_environments(capture: Capture) -> None:
             )
 
 
-def check_pairs(capture: Capture) -> None:
-    """Demand at most one photograph per camera and light.
-
-    Raises
-    ------
-    CaptureError
-        Naming the first pair that repeats.
-    """
-    seen: dict[tuple[int, int], str] = {}
-    for photograph in capture.photographs:
-        pair = (photograph.camera, photograph.light)
-        if pair in seen:
-            raise CaptureError(
-                f"duplicate photograph of camera {capture.cameras[pair[0]].id!r} under light "
-                f"{capture.lights[pair[1]].id!r}: {seen[pair]!r} and {photograph.name!r}; "
-                "keep one of them"
-            )
-        seen[pair] = photograph.name
-
-
 def _made_silhouette(capture: Capture, view: int) -> NDArray[np.float32]:
     return silhouette_from_photographs(
         (capture.read_photograph(i) for i in _sampled(capture, view)),

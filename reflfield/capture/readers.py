@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from reflfield.capture import lp, middlebury, native, transforms_json
+from reflfield.capture.consistency import check_lights_shine, check_pairs, unphotographed
 from reflfield.capture.documents import parse_count, read_json, read_text
-from reflfield.capture.model import Capture, check_environments, check_pairs, check_photographs
+from reflfield.capture.model import Capture, check_environments, check_photographs
+from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
 
 _logger = logging.getLogger(__name__)
@@ -81,12 +83,15 @@ def open_capture(
     else:
         description, found = path, format or _kind_of_file(path)
     capture = _read(description, found, follow_links=follow_links, test_split=test_split)
-    for note in capture.notes:
-        _logger.warning("%s", note)
     check_environments(capture)
     if require_photographs:
         check_pairs(capture)
+        check_lights_shine(capture)
+        check_poses(capture.cameras, capture.description)
         check_photographs(capture)
+        capture = replace(capture, notes=(*capture.notes, *unphotographed(capture)))
+    for note in capture.notes:
+        _logger.warning("%s", note)
     return capture
 
 

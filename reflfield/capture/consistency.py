@@ -1,0 +1,75 @@
+"""Whether a capture's photographs, cameras and lights fit together."""
+
+from __future__ import annotations
+
+from reflfield.capture.model import Capture
+from reflfield.errors import CaptureError
+
+
+def check_pairs(capture: Capture) -> None:
+    """Demand at most one photograph per camera and light.
+
+    Raises
+    ------
+    CaptureError
+        Naming the first pair that repeats; where nothing is known of its light, that the
+        lights are missing.
+    """
+    seen: dict[tuple[int, int], str] = {}
+    for photograph in capture.photographs:
+        pair = (photograph.camera, photograph.light)
+        if pair in seen:
+            camera, light = capture.cameras[pair[0]], capture.lights[pair[1]]
+            names = f"{seen[pair]!r} and {photograph.name!r}"
+            if not light.known:
+                n = sum((p.camera, p.light) == pair for p in capture.photographs)
+                raise CaptureError(
+                    f"{capture.description}: light positions are missing: camera {camera.id!r} "
+                    f"has {n} photographs ({names} among them), and nothing says how their "
+                    "lights differ; give each frame of transforms.json its light's 'pl_pos' "
+                    "(and 'pl_intensity') or 'environment', or list the lights in "
+                    "capture.json; where the lighting never changes, keep one photograph per "
+                    "camera"
+                )
+            raise CaptureError(
+                f"{capture.description}: duplicate photograph of camera {camera.id!r} under "
+                f"light {light.id!r}: {names}; keep one of them"
+            )
+        seen[pair] = photograph.name
+
+
+def check_lights_shine(capture: Capture) -> None:
+    """Demand that every light with a photograph gives light.
+
+    Raises
+    ------
+    CaptureError
+        Naming the first light that does not, and one of its photographs.
+    """
+    dark = [not light.shines for light in capture.lights]
+    for photograph in capture.photographs:
+        if dark[photograph.light]:
+            raise CaptureError(
+                f"{capture.description}: light {capture.lights[photograph.light].id!r} of "
+                f"photograph {photograph.name!r}: expected an intensity above 0 in some "
+                "channel, received 0 in all; correct it, or leave out photographs without light"
+            )
+
+
+def unphotographed(capture: Capture) -> tuple[str, ...]:
+    """Notes on cameras and lights without photographs."""
+    views = {photograph.camera for photograph in capture.photographs}
+    lights = {photograph.light for photograph in capture.photographs}
+    names = {
+        "camera": [c.id for i, c in enumerate(capture.cameras) if i not in views],
+        "light": [light.id for i, light in enumerate(capture.lights) if i not in lights],
+    }
+    totals = {"camera": capture.n_views, "light": capture.n_lights}
+    notes = []
+    for what, idle in names.items():
+        if idle:
+            notes.append(
+                f"{capture.description}: no photograph for {what} {', '.join(idle[:5])}"
+                f"{' ...' if len(idle) > 5 else ''} ({len(idle)} of {totals[what]})"
+            )
+    return tuple(notes)
