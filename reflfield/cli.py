@@ -449,7 +449,7 @@ def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     from reflfield.steps.choices import words_of
     from reflfield.steps.holding_out import held_out_words, left_out_words
-    from reflfield.steps.outputs import published
+    from reflfield.steps.publishing import published
     from reflfield.steps.quantising import missed_quality
 
     for record in job.stages.records:

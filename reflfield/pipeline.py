@@ -24,6 +24,7 @@ from reflfield.steps import (
     evaluation,
     indirect,
     outputs,
+    publishing,
     rate_distortion,
     reflectance,
     surface,
@@ -301,8 +302,10 @@ def run(
                     job = settled(job)
             elif stage.wanted(job):
                 stage.run(job)
-                outputs.publish(job, stage.name)
-        outputs.publish_records(job)
+                if job.stages.record("compression") is not None:
+                    publishing.publish(job)
+        publishing.publish(job)
+        publishing.publish_records(job, last, whole=last == STAGES[-1])
     return job
 
 

@@ -1,11 +1,10 @@
-"""What a run leaves beside the stages' folders: field, pictures, meshes, report, records."""
+"""What a run shows of its results: pictures, meshes, the report."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,9 @@ from reflfield.comparison.metrics import Comparison, compare_frames
 from reflfield.comparison.pictures import texture
 from reflfield.comparison.report import ReportContent, Section, write_report
 from reflfield.comparison.truth import open_truth
-from reflfield.config import write_toml
 from reflfield.export.gltf import write_glb
 from reflfield.field.file import describe, open_field
 from reflfield.field.model import ReflectanceField
-from reflfield.files import replacing
 from reflfield.geometry.visibility import RayScene
 from reflfield.observations.store import ObservationStore
 from reflfield.stages import plain, versions
@@ -42,61 +39,6 @@ FRAME_TITLES = {
 # Memory of one such sample: RGB as half and as float, whether it is observed, twice.
 SAMPLE_BYTES = 24
 AVERAGES = "averages.npz"
-
-
-# What of a stage's folder goes to which place in the output folder, in the order listed.
-RESULTS = {
-    "compression": {"field.rfld": "field.rfld"},
-    "hull": {"hull.ply": "hull.ply"},
-    "maps": {name: name for name in ("atlas.glb", "normals.exr", "tangents.exr")},
-    "comparison": {"metrics.json": "metrics.json"},
-    "report": {"index.html": "report/index.html"},
-}
-TIMINGS = "timings.json"
-
-
-def publish(job: Job, stage: str) -> None:
-    """Copy what a stage has made to its place in the output folder, each file whole.
-
-    Done as soon as the stage is, so that no later failure withholds it.
-    """
-    for source, target in RESULTS.get(stage, {}).items():
-        if job.stages.record(stage) is not None:
-            (job.out / target).parent.mkdir(parents=True, exist_ok=True)
-            with replacing(job.out / target) as partial:
-                shutil.copyfile(job.stages.root / stage / source, partial)
-
-
-def publish_records(job: Job) -> None:
-    """Write how long the stages took, and with which options they ran."""
-    with replacing(job.out / TIMINGS) as partial:
-        partial.write_text(json.dumps(timings(job), indent=1) + "\n")
-    with replacing(job.out / "options.toml") as partial:
-        write_toml(partial, job.asked_options, list(choices.words_of(job)))
-
-
-def published(job: Job) -> list[Path]:
-    """Results of this run in the output folder; none that an earlier run has left there."""
-    names = [
-        target
-        for stage, files in RESULTS.items()
-        if job.stages.record(stage) is not None
-        for target in files.values()
-    ]
-    return [job.out / name for name in (*names, TIMINGS)]
-
-
-def timings(job: Job) -> dict[str, Any]:
-    """Time, memory, sizes and counts of every stage, with versions."""
-    records = [plain(asdict(record)) for record in job.stages.records]
-    return {
-        "stages": records,
-        "seconds": choices.total_seconds(job),
-        "peak_bytes": max((record["peak_bytes"] for record in records), default=0),
-        "workers": job.resources.workers,
-        "max_memory": job.resources.max_memory,
-        "versions": versions(),
-    }
 
 
 def write_maps(job: Job, folder: Path) -> dict[str, Any]:

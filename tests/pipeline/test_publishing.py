@@ -1,83 +1,203 @@
-"""What is finished is in the output folder before what comes after it can fail."""
+"""Output folder: what stands there was made from each other; what does not is set apart."""
 
+import dataclasses
 import json
-import re
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from reflfield import pipeline
+from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
-from reflfield.field.file import open_field
+from reflfield.stages import plain
+from reflfield.steps.options import PipelineOptions
+from reflfield.steps.publishing import RESULTS
 
-BARE = (
-    "--set", "comparison.without_alignment=false",
-    "--set", "comparison.rate_distortion=false",
-)  # fmt: skip
+FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
+SETTLED = PipelineOptions(
+    resampling=replace(PipelineOptions().resampling, visibility="kept"),
+    compression=replace(PipelineOptions().compression, fit="samples"),
+)
+OTHER_ALIGNMENT = replace(SETTLED, alignment=replace(SETTLED.alignment, enabled=False))
+OTHER_HULL = replace(SETTLED, hull=replace(SETTLED.hull, resolution=99))
+FIELD = {"field.rfld", "hull.ply"}
+LATER = {"atlas.glb", "normals.exr", "tangents.exr", "metrics.json", "report/index.html"}
+RECORDS = {"timings.json", "options.toml"}
+
+
+def small(stage):
+    """A stage that writes, in no time, what its options and those before it say."""
+
+    def compute(job, folder):
+        before = {name: job.stages.key(name) for name in stage.after if job.stages.record(name)}
+        text = json.dumps([stage.name, plain(stage.options(job.options)), before])
+        for name in ("value", *RESULTS.get(stage.name, {})):
+            (folder / name).write_text(text)
+        return {}
+
+    return dataclasses.replace(stage, compute=compute)
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return open_capture(shutil.copytree(FROZEN, tmp_path / "capture"))
+
+
+@pytest.fixture
+def run(monkeypatch, capture, tmp_path):
+    """Function that runs the pipeline with small stages into a folder."""
+    order = tuple(small(stage) for stage in pipeline.ORDER)
+    monkeypatch.setattr(pipeline, "ORDER", order)
+    monkeypatch.setattr(pipeline, "BY_NAME", {stage.name: stage for stage in order})
+
+    def pipeline_run(options=SETTLED, **named):
+        return pipeline.run(capture, tmp_path / "out", options, **named)
+
+    return pipeline_run
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+def results(out):
+    """Files of the output folder, those that are set apart included."""
+    skipped = ("stages", "trials")
+    return {
+        path.relative_to(out).as_posix(): path.read_text()
+        for path in out.rglob("*")
+        if path.is_file() and path.relative_to(out).parts[0] not in skipped
+    }
+
+
+def test_a_whole_run_publishes_all_and_nothing_is_outdated(run, out):
+    run()
+    assert set(results(out)) == FIELD | LATER | RECORDS
+
+
+def test_unchanged_results_are_left_alone(run, out):
+    run()
+    before = {name: (out / name).stat().st_mtime_ns for name in FIELD | LATER}
+    job = run()
+    assert all(record.reused for record in job.stages.records)
+    assert {name: (out / name).stat().st_mtime_ns for name in FIELD | LATER} == before
 
 
 @pytest.mark.parametrize(
-    ("function", "failure", "left"),
+    ("options", "last", "new", "outdated"),
     [
-        (
-            "reflfield.steps.evaluation.compare_with_photographs",
-            InputError("frame 'v005_l003': no"),
-            {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr"},
-        ),
-        (
-            "reflfield.steps.outputs.report_content",
-            OSError(122, "Disk quota exceeded"),
-            {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
-             "metrics.json"},
-        ),
+        (OTHER_ALIGNMENT, "compression", {"field.rfld"}, LATER),
+        (OTHER_ALIGNMENT, "alignment", set(), LATER | {"field.rfld"}),
+        (OTHER_HULL, "hull", {"hull.ply"}, LATER | {"field.rfld"}),
+        (OTHER_HULL, "compression", FIELD, LATER),
+        (SETTLED, "hull", set(), set()),
+        (SETTLED, "compression", set(), set()),
+        # Another option, but not of what was run: field and report are of each other.
+        (OTHER_ALIGNMENT, "hull", set(), set()),
     ],
-)  # fmt: skip
-def test_the_field_is_there_whatever_fails_later(
-    run_tiny, run_copy, monkeypatch, function, failure, left
-):
-    for path in run_copy.iterdir():
-        if path.name != "stages":
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+)
+def test_what_does_not_follow_is_set_apart(run, out, caplog, options, last, new, outdated):
+    run()
+    before = results(out)
+    run(options, last=last)
+    after = results(out)
+    assert set(after) == (FIELD | LATER | RECORDS) - outdated | {
+        f"outdated/{name}" for name in outdated
+    }
+    for name in outdated:
+        assert after[f"outdated/{name}"] == before[name]
+    kept = (FIELD | LATER) - outdated
+    assert {name for name in kept if after[name] != before[name]} == new
+    assert ("outdated: made from other stages than now" in caplog.text) == bool(outdated)
+    assert f"Of a run up to the stage '{last}'" in after["options.toml"]
+    # A whole run leaves nothing outdated.
+    caplog.clear()
+    run(options)
+    assert set(results(out)) == FIELD | LATER | RECORDS
+    assert "outdated" not in caplog.text
 
-    def fails(*_, **__):
-        raise failure
 
-    monkeypatch.setattr(function, fails)
-    outcome = run_tiny(run_copy, *BARE, "--from", "comparison")
-    assert outcome.status == 2
-    (said,) = [s for s in outcome.err.splitlines() if " left" not in s]
-    assert str(failure.args[-1]) in said
-    assert said.endswith(f"; the field is finished: {run_copy / 'field.rfld'}")
-    assert {p.name for p in run_copy.iterdir()} == left | {"stages"}
-    assert open_field(run_copy / "field.rfld").n_texels > 500
+def test_a_failure_after_the_field_leaves_no_earlier_report_beside_it(run, out, monkeypatch):
+    run()
+    before = results(out)
 
+    def fails(job, folder):
+        raise InputError("frames: damaged")
 
-def test_a_camera_without_photographs_is_said_and_worked_around(
-    run_tiny, capture_copy, described, tmp_path
-):
-    def without_v002(document):
-        document["photographs"] = [
-            {"camera": c["id"], "light": li["id"], "file": f"photographs/{name}.exr"}
-            for c in document["cameras"]
-            for li in document["lights"]
-            if (name := f"{c['id']}_{li['id']}") and c["id"] != "v002" and li["id"] != "l004"
-        ]
-
-    described(capture_copy, without_v002)
-    out = tmp_path / "out"
-    outcome = run_tiny(out, *BARE, capture=capture_copy)
-    assert outcome.status == 0, outcome.err
-    assert "1 camera without a photograph, of which only the silhouette is used: 'v002'" in (
-        outcome.out
+    order = tuple(
+        replace(stage, compute=fails) if stage.name == "comparison" else stage
+        for stage in pipeline.ORDER
     )
-    assert "1 light without a photograph, left out: 'l004'" in outcome.out
-    # Nine cameras and five lights have photographs; one of each is held out.
-    assert (
-        "held out: 1 photograph of 1 held-out view under 1 held-out light is compared; "
-        "12 others of those are used for neither; 32 of 45 make the field"
-    ) in outcome.out
-    assert open_field(out / "field.rfld").metadata["views"] == 9
-    assert len(json.loads((out / "metrics.json").read_text())["frames"]) == 1
-    page = (out / "report" / "index.html").read_text()
-    assert "of which only the silhouette is used" in page
-    # All nine cameras' silhouettes are set against the hull, the one without pictures too.
-    assert len(re.findall(r"<span>v\d+ · IoU", page)) == 9
+    monkeypatch.setattr(pipeline, "ORDER", order)
+    with pytest.raises(InputError, match="frames: damaged"):
+        run(OTHER_ALIGNMENT)
+    after = results(out)
+    assert after["field.rfld"] != before["field.rfld"]
+    assert after["hull.ply"] == before["hull.ply"]
+    assert not {"metrics.json", "report/index.html"} & set(after)
+    assert after["outdated/metrics.json"] == before["metrics.json"]
+
+
+def test_an_earlier_field_stays_until_there_is_another(run, out, monkeypatch):
+    run()
+    before = results(out)
+
+    def fails(job, folder):
+        raise InputError("memory: full")
+
+    order = tuple(
+        replace(stage, compute=fails) if stage.name == "compression" else stage
+        for stage in pipeline.ORDER
+    )
+    monkeypatch.setattr(pipeline, "ORDER", order)
+    with pytest.raises(InputError, match="memory: full"):
+        run(OTHER_HULL)
+    assert results(out) == before
+
+
+@pytest.mark.parametrize("damage", ["one bit", "empty", "gone"])
+@pytest.mark.parametrize("name", ["compression/field.rfld", "hull/hull.ply"])
+def test_a_damaged_stage_file_never_replaces_the_result(run, out, caplog, name, damage):
+    run()
+    before = results(out)
+    path = out / "stages" / name
+    if damage == "gone":
+        path.unlink()
+    else:
+        text = bytearray(path.read_bytes())
+        text[len(text) // 2] ^= 16
+        path.write_bytes(text if damage == "one bit" else b"")
+    job = run()
+    computed = [record.name for record in job.stages.records if not record.reused]
+    assert computed == [name.split("/")[0]]
+    assert f"{name}: damaged or gone; the stage" in caplog.text
+    assert {n: t for n, t in results(out).items() if n not in RECORDS} == {
+        n: t for n, t in before.items() if n not in RECORDS
+    }
+
+
+def test_damaged_after_it_was_verified_it_is_not_published(run, out, monkeypatch):
+    run()
+    (out / "field.rfld").unlink()
+    copy = shutil.copyfile
+
+    def damaging(source, target):
+        copy(source, target)
+        Path(target).write_bytes(b"\0" + Path(target).read_bytes()[1:])
+
+    monkeypatch.setattr(shutil, "copyfile", damaging)
+    with pytest.raises(InputError, match=r"field\.rfld: expected the file that the stage"):
+        run()
+    assert not (out / "field.rfld").exists()
+    assert not list(out.glob(".*"))
+
+
+def test_a_damaged_result_is_replaced_by_the_intact_one(run, out):
+    run()
+    before = results(out)
+    (out / "field.rfld").write_text("damaged")
+    run()
+    assert results(out)["field.rfld"] == before["field.rfld"]
