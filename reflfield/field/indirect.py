@@ -11,12 +11,17 @@ each channel. What each texel shows is scattered: it lies in the shadow of some 
 Texels are therefore taken as draws of one Gaussian over coefficients, whose mean
 and covariance follow by expectation maximisation from what each has (Dempster, Laird, Rubin
 1977); B are the leading axes of the covariance, c the posterior means along them.
+
+Nothing is extrapolated. Towards lights from where none of the capture's came, a texel shows
+what it would under the nearest of those (`field.observed_sphere`); and no texel is made
+brighter than it was seen under any light in whose shadow it lay.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from math import isqrt
 from typing import Any
 
@@ -25,6 +30,7 @@ from numpy.typing import NDArray
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.field.observed_sphere import bounded_table, interpolate
 from reflfield.observations.reading import Shade
 from reflfield.sphere.harmonics import n_coefficients, real_harmonics
 
@@ -44,6 +50,9 @@ SMOOTHNESS = 0.1
 # Less than this share of that is nothing; keeps covariances regular.
 LEAST_SHARE = 1e-9
 TEXELS_AT_ONCE = 1024
+# Times that what a texel shows is brought back to its brightest sample, and the standard
+# deviation that this limit counts with, over the sample.
+LIMIT_ROUNDS, LIMIT_SHARE = 2, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +66,20 @@ class IndirectLight:
         light's direction in the world. Root mean square of a basis function over the sphere
         and the channels: 1.
     coefficients : (n_texels, K) float32
+    observed : (n, 3) float64, optional
+        Directions of the lights that the functions are known for; beyond them the nearest
+        ones count. By default the functions are taken as they are everywhere.
     """
 
     functions: Floats
     coefficients: Floats
+    observed: Array | None = None
 
     def __post_init__(self) -> None:
         check_shape("functions", self.functions, (None, None, 3))
         check_shape("coefficients", self.coefficients, (None, len(self.functions) - 1))
+        if self.observed is not None:
+            check_shape("observed", self.observed, (None, 3))
 
     @property
     def is_black(self) -> bool:
@@ -80,6 +95,33 @@ class IndirectLight:
         """(n, K + 1): 1, then the coefficients."""
         ones = np.ones((len(texels), 1), np.float32)
         return np.concatenate([ones, self.coefficients[texels]], axis=1)
+
+    def _harmonic_sums(self, directions: NDArray[Any]) -> Floats:
+        """Functions as they were fitted, (n, (K + 1) * 3)."""
+        harmonics = real_harmonics(directions, self.band_limit).astype(np.float32)
+        # (n_harmonics, K + 1, 3): one product for all functions and channels.
+        by_harmonic = np.moveaxis(self.functions, 1, 0).reshape(self.functions.shape[1], -1)
+        return np.asarray(harmonics @ by_harmonic)
+
+    @cached_property
+    def _table(self) -> Floats:
+        """Functions over the sphere, bounded by the observed directions."""
+        observed = np.zeros((0, 3)) if self.observed is None else self.observed
+        return bounded_table(self._harmonic_sums, observed)
+
+    def at(self, directions: NDArray[Any]) -> Floats:
+        """Functions under lights from some directions, (n, K + 1, 3) float32.
+
+        Parameters
+        ----------
+        directions : (n, 3) float
+            Unit vectors to the light, world frame.
+        """
+        if self.observed is None or not len(self.observed):
+            values = self._harmonic_sums(directions)
+        else:
+            values = interpolate(self._table, directions)
+        return values.reshape(len(directions), len(self.functions), 3)
 
     def towards(
         self, texels: NDArray[np.integer], directions: NDArray[Any], power: int
@@ -99,20 +141,15 @@ class IndirectLight:
         (n, 3) float32
             1/sr, never negative.
         """
-        harmonics = real_harmonics(directions, self.band_limit).astype(np.float32)
-        # (n_harmonics, K + 1, 3): one product for all functions and channels.
-        by_harmonic = np.moveaxis(self.functions, 1, 0).reshape(self.functions.shape[1], -1)
-        at_light = (harmonics @ by_harmonic).reshape(len(texels), len(self.functions), 3)
-        values = np.einsum("nk,nkc->nc", self._weights(texels), at_light)
+        values = np.einsum("nk,nkc->nc", self._weights(texels), self.at(directions))
         return np.maximum(values, 0) ** power
 
     def under(
         self, texels: NDArray[np.integer], directions: NDArray[Any], power: int
     ) -> Floats:
         """Indirect light of texels under lights that all share, (n, m, 3); see `towards`."""
-        harmonics = real_harmonics(directions, self.band_limit).astype(np.float32)
-        at_lights = np.einsum("mh,khc->kmc", harmonics, self.functions, optimize=True)
-        values = self._weights(texels) @ at_lights.reshape(len(self.functions), -1)
+        at_lights = np.moveaxis(self.at(directions), 1, 0).reshape(len(self.functions), -1)
+        values = self._weights(texels) @ at_lights
         return np.maximum(values.reshape(len(texels), len(directions), 3), 0) ** power
 
 
@@ -163,15 +200,41 @@ class IndirectModel:
         return rows.reshape(len(rows), -1, 3).astype(np.float32)
 
     def coefficients(self, shade: Shade) -> Floats:
-        """Posterior means of some texels, (n, K); 0 without shade."""
-        system = Systems.of(shade, self.band_limit)
+        """Posterior means of some texels, (n, K); 0 without shade.
+
+        A texel that would show more, under one of the lights without a sample, than in any
+        of its samples is asked again with that light sample at its brightest, which counts
+        as known to `LIMIT_SHARE`: little where the samples determine the coefficients.
+        """
         if not len(self.variances):
             return np.zeros((len(shade.values), 0), np.float32)
+        seen = shade.weights > 0
+        brightest = np.where(seen[..., None], shade.values, -np.inf).max(axis=1, keepdims=True)
+        # The brightest sample has noise itself.
+        limit = np.where(np.isfinite(brightest), brightest + self.noise**0.5, np.inf)
+        known_to = np.maximum((LIMIT_SHARE * limit.max(axis=2)) ** 2, self.noise)
+        harmonics = real_harmonics(shade.lights.reshape(-1, 3), self.band_limit)
+        harmonics = harmonics.reshape(*seen.shape, -1)
+        means = self._posterior(Systems.of(shade, self.band_limit))
+        for _ in range(LIMIT_ROUNDS):
+            coefficients = self.mean + means @ self.axes.T
+            shown = harmonics @ coefficients.reshape(len(means), -1, 3)
+            beyond = (shown > limit).any(axis=2) & ~seen
+            if not beyond.any():
+                break
+            values = np.where(seen[..., None], shade.values, np.minimum(shown, limit))
+            weights = shade.weights + beyond * (self.noise / known_to)
+            limited = Shade(values.astype(np.float32), weights, shade.lights)
+            means = self._posterior(Systems.of(limited, self.band_limit))
+        return (means / self.unit).astype(np.float32)
+
+    def _posterior(self, system: Systems) -> Array:
+        """Means along the axes, (n, K)."""
         precision = np.diag(1.0 / self.variances)
         gram = np.einsum("ak,nab,bl->nkl", self.axes, system.gram, self.axes, optimize=True)
         moments = (system.moments - system.gram @ self.mean) @ self.axes
         solved = np.linalg.solve(gram / self.noise + precision, moments[..., None] / self.noise)
-        return (solved[..., 0] / self.unit).astype(np.float32)
+        return np.asarray(solved[..., 0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from reflfield.checks import unit_direction
 from reflfield.errors import InputError, ShapeError
 from reflfield.field.indirect import IndirectLight
+from reflfield.field.observed_sphere import MOST_OBSERVED
 from reflfield.field.quantisation import (
     QuantisedBox,
     check_finite,
@@ -183,7 +184,31 @@ class ReflectanceField:
         check_finite("indirect_functions", functions)
         check_finite("indirect_scale", scale)
         codes = self.arrays["indirect_coefficients"].astype(np.float32)
-        return IndirectLight(functions, codes * scale)
+        return IndirectLight(functions, codes * scale, self.observed_lights)
+
+    @cached_property
+    def observed_lights(self) -> NDArray[np.float64] | None:
+        """(n, 3) unit directions that the capture's lights came from; None if not stated.
+
+        Raises
+        ------
+        InputError
+            If the metadata state something else than directions.
+        """
+        stated = self.metadata.get("observed_lights")
+        if stated is None:
+            return None
+        try:
+            directions = np.asarray(stated, np.float64).reshape(-1, 3)
+            lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+            if not (np.abs(lengths - 1.0) < 0.1).all() or len(directions) > MOST_OBSERVED:
+                raise ValueError
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(
+                f"metadata: observed_lights: expected at most {MOST_OBSERVED} unit directions, "
+                f"received {stated!r:.100}"
+            ) from None
+        return directions / lengths
 
     @property
     def mean(self) -> NDArray[np.float32]:

@@ -21,7 +21,9 @@ from reflfield.field.compression import CompressionOptions
 from reflfield.field.file import PackedSizes
 from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
+from reflfield.field.observed_sphere import distinct_directions
 from reflfield.field.rate import field_of_quality, field_of_size
+from reflfield.observations.projection import directions_of
 from reflfield.observations.reading import TexelReader
 from reflfield.progress import track
 from reflfield.stages import versions
@@ -183,9 +185,11 @@ def field_metadata(job: Job, made_with: dict[str, Any]) -> dict[str, Any]:
     """What a field says of its making: nothing that a change would not make again."""
     later = ("relighting", "comparison")
     options = {name: value for name, value in made_with.items() if name not in later}
+    observed = {"observed_lights": observed_lights(job)} if job.finds_indirect_light else {}
     return {
         "capture": job.capture.name,
         "up": job.capture.up.tolist(),
+        **observed,
         "views": job.training.n_views,
         "lights": job.training.n_lights,
         "photographs": len(job.training.photographs),
@@ -215,3 +219,10 @@ def missed_quality(job: Job) -> str:
         "most that this model has; raise texture.texels_per_pixel or compression.rank, or ask "
         "for less"
     )
+
+
+def observed_lights(job: Job) -> list[list[float]]:
+    """Directions from the object's centre to the lights, rounded."""
+    centre = job.texels.position.mean(axis=0, dtype=np.float64)
+    _, lights = directions_of(job.training, centre[None])
+    return distinct_directions(lights[0]).tolist()

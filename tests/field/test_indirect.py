@@ -15,6 +15,7 @@ from reflfield.field.indirect import (
     fit_indirect,
     no_indirect_light,
 )
+from reflfield.field.observed_sphere import covered
 from reflfield.field.synthetic import square_surface
 from reflfield.observations.reading import Shade
 from reflfield.sphere.harmonics import real_harmonics
@@ -82,7 +83,9 @@ def test_more_noise_is_more_error_in_proportion(rng):
         error = domain_values(found, elsewhere) - domain_values(truth, elsewhere)
         errors.append(np.sqrt(np.mean(error**2)))
     slope = np.diff(np.log(errors)) / np.log(10)
-    assert np.all((slope > 0.8) & (slope < 1.1)), errors
+    # At noise .1 the limit, the brightest sample known to a tenth (.5), counts for .04 of a
+    # sample in each of up to 18 lights beside the 12: measured 1.12.
+    assert np.all((slope > 0.8) & (slope < 1.15)), errors
 
 
 @pytest.mark.stability
@@ -178,6 +181,56 @@ def test_both_evaluations_agree(rng):
     assert under.min() >= 0
     assert light.towards(np.zeros(0, int), np.zeros((0, 3)), 3).shape == (0, 3)
     assert light.under(np.zeros(0, int), lights, 3).shape == (0, 7, 3)
+
+
+DOME = np.array(
+    [[np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]
+     for e, n in ((0.2, 12), (0.7, 8), (1.2, 4)) for a in 2 * np.pi * np.arange(n) / n]
+)  # fmt: skip
+
+
+def test_lights_from_where_none_came_bring_what_the_nearest_did(rng):
+    """Harmonics that are planted on a dome take any value below it; the light does not."""
+    light = IndirectLight(
+        rng.standard_normal((2, 16, 3)).astype(np.float32),
+        rng.standard_normal((50, 1)).astype(np.float32),
+        DOME,
+    )
+    texels, below = np.arange(50), directions(rng, 200) * [1, 1, -1]
+    below = below[below[:, 2] < -0.2]
+    everywhere = directions(rng, 5000)
+    dome = everywhere[covered(everywhere, DOME)]
+    shown = light.under(texels, np.concatenate([DOME, dome]), 1)
+    found = light.under(texels, below, 1)
+    # The table interpolates in steps of 2 degrees: h^2 / 8 l (l + 1) of the largest.
+    slack = (np.pi / 90) ** 2 / 8 * 12 * shown.max()
+    assert np.all(found.max(axis=1) <= shown.max(axis=1) + slack)
+    assert np.all(found.min(axis=1) >= shown.min(axis=1) - slack)
+    unbounded = replace(light, observed=None).under(texels, below, 1)
+    assert np.mean(unbounded.max(axis=1) > shown.max(axis=1) + slack) > 0.3
+    towards = light.towards(np.repeat(texels, len(below)), np.tile(below, (50, 1)), 1)
+    np.testing.assert_allclose(found.reshape(-1, 3), towards, rtol=1e-4, atol=1e-5)
+
+
+def test_no_texel_is_made_brighter_than_it_was_seen(monkeypatch, rng):
+    """Half of the texels shine into themselves; the others were seen dark, under one light."""
+    lights = np.broadcast_to(DOME, (200, *DOME.shape)).astype(np.float32)
+    towards_x = 0.8 + 0.7 * lights[..., 0]
+    values = np.where(np.arange(200)[:, None] < 100, towards_x, 0.1)
+    weights = np.ones((200, len(DOME)), np.float32)
+    weights[100:150] = np.arange(len(DOME)) == 6  # towards -X, as dark in the others
+    noisy = values[..., None] + 0.02 * rng.standard_normal((200, len(DOME), 3))
+    shade = Shade(noisy.astype(np.float32), weights, lights)
+
+    def brightest():
+        model = fit_indirect(lambda some_: some(shade, some_), np.arange(200), len(DOME), 2)
+        light = IndirectLight(model.functions(), model.coefficients(shade), DOME)
+        return light.under(np.arange(100, 150), DOME, 1).max()
+
+    # The sample, and three standard deviations of its noise and of the model's.
+    assert brightest() < 0.1 + 6 * 0.02
+    monkeypatch.setattr("reflfield.field.indirect.LIMIT_ROUNDS", 0)
+    assert brightest() > 0.5
 
 
 def test_field_keeps_it_within_half_a_step(parts):
