@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.cameras import FISHEYE, OPENCV, Camera, not_rigid_because
+from reflfield.capture.cameras import FISHEYE, LONGEST_SIDE, OPENCV, Camera, not_rigid_because
 from reflfield.capture.documents import number, number_array
 from reflfield.capture.image_files import image_size
 from reflfield.capture.names import quoted
@@ -103,8 +103,10 @@ def _size(frame: Frame, path: Path) -> tuple[int, int]:
 
 def _pixels(frame: Frame, name: str) -> int:
     value = frame.number(name, 0.0)
-    if value != int(value):
-        raise CaptureError(f"{frame.what}: {name}: expected whole pixels, received {value}")
+    if not 1 <= value <= LONGEST_SIDE or value != int(value):
+        raise CaptureError(
+            f"{frame.what}: {name}: expected 1 to {LONGEST_SIDE} whole pixels, received {value}"
+        )
     return int(value)
 
 
