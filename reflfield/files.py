@@ -86,11 +86,11 @@ def read_bytes(path: Path, most_bytes: int, error: type[InputError] = InputError
         )
     try:
         with path.open("rb") as file:
-            content = file.read(most_bytes + 1)
+            content = file.read(size + 1)
     except OSError as failure:
         raise error(f"{path}: cannot be read ({failure.strerror or failure})") from failure
-    if len(content) > most_bytes:
-        raise error(f"{path}: expected at most {most_bytes:,} bytes, but the file grows")
+    if len(content) > size:
+        raise error(f"{path}: expected {size:,} bytes, but the file grows; is it in use?")
     return content
 
 

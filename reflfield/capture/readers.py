@@ -14,6 +14,7 @@ from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.model import Capture, check_environments, check_photographs
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
+from reflfield.files import check_regular
 
 _logger = logging.getLogger(__name__)
 
@@ -123,6 +124,10 @@ def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
         return train, "transforms"
     if len(found) == 1:
         return found[0]
+    for name in (native.FILE_NAME, transforms_json.FILE_NAME):
+        other = folder / name
+        if not found and (other.is_dir() or other.is_symlink()):
+            check_regular(other, CaptureError)  # says what it is
     wanted = ", ".join(r.pattern for name, r in READERS.items() if format in (None, name))
     received = ", ".join(file.name for file, _ in found) or "none of them"
     remedy = "name the file itself" if found else "is this the capture's own folder?"
