@@ -90,12 +90,15 @@ def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     values : (n, n_views, n_lights, 3) float
+        NaN where a channel was not measured.
     observed : (n, n_views, n_lights) bool
 
     Returns
     -------
     (n, 3) float
     """
-    weight = observed.sum(axis=(1, 2))
-    total = np.einsum("nvlc,nvl->nc", values.astype(np.float32), observed.astype(np.float32))
-    return total / np.where(weight > 0, weight, np.nan)[:, None]
+    measured = ~np.isnan(values)
+    counted = observed.astype(np.float32)
+    weight = np.einsum("nvlc,nvl->nc", measured.astype(np.float32), counted)
+    total = np.einsum("nvlc,nvl->nc", np.where(measured, values, 0).astype(np.float32), counted)
+    return total / np.where(weight > 0, weight, np.nan)

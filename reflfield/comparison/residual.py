@@ -81,25 +81,29 @@ def sample_error(
     measured, predicted, irradiance = (
         np.concatenate(part) for part in zip(*parts, strict=True)
     )
+    values = ~np.isnan(measured)
+    pair = predicted[values], measured[values]
     return SampleError(
-        linear=_relative(predicted, measured),
-        cube_root=_relative(np.cbrt(predicted), np.cbrt(measured)),
+        linear=_relative(*pair),
+        cube_root=_relative(*(np.cbrt(value) for value in pair)),
         psnr_ldr=_psnr_ldr(predicted * irradiance, measured * irradiance),
         n_texels=n,
-        n_samples=len(measured),
+        n_samples=int(np.count_nonzero(values.any(axis=1))),
     )
 
 
 def _radiances(
     field: ReflectanceField, reader: TexelReader, texels: NDArray[np.intp]
 ) -> tuple[Floats, Floats, Floats]:
-    """Observed samples of some texels, the field's, and the irradiance they are over."""
+    """Observed samples of some texels, the field's, and the irradiance they are over.
+
+    Values that were not measured are NaN.
+    """
     found = reader.measured(texels)
-    seen = found.view_seen[:, :, None] & found.light_seen[:, None] & found.pairs
-    t, i, j = np.nonzero(seen)
+    t, i, j = np.nonzero(found.seen)
     irradiance = facing_irradiance(reader.capture.lights, reader.positions[texels])
     return (
-        found.samples[t, i, j].astype(np.float32),
+        found.samples[t, i, j].astype(np.float32) * np.float32(found.unit),
         evaluate(field, texels[t], found.views[t, i], found.lights[t, j]),
         irradiance[t, j],
     )
@@ -112,9 +116,11 @@ def _relative(predicted: Floats, measured: Floats) -> float:
 
 
 def _psnr_ldr(predicted: Floats, measured: Floats) -> float:
-    white = float(np.percentile(measured @ LUMINANCE, 99.5))
+    white = float(np.percentile(np.nan_to_num(measured) @ LUMINANCE, 99.5))
     exposure = 1.0 / white if white > 0 else 1.0
+    known = ~np.isnan(measured)
     shown = [
-        encode_srgb(np.clip(exposure * values, 0.0, 1.0)) for values in (measured, predicted)
+        encode_srgb(np.clip(exposure * values[known], 0.0, 1.0))
+        for values in (measured, predicted)
     ]
     return psnr(*shown)

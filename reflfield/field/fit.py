@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
-from reflfield.observations.resampling import RootedSamples
+from reflfield.observations.resampling import ALL_CHANNELS, Channels, RootedSamples
 from reflfield.progress import report, track
 
 Floats = NDArray[np.float32]
@@ -184,6 +184,7 @@ def _spread(plane: Floats, nodes: Ints, weights: Floats, values: Floats) -> None
 def _add_normal_equations(
     values: Floats,
     weights: Floats,
+    channels: Channels,
     plane: Floats,
     light_nodes: Ints,
     light_taps: Floats,
@@ -191,15 +192,20 @@ def _add_normal_equations(
     right: NDArray[np.float64],
     squares: NDArray[np.float64],
 ) -> None:
-    """Add one texel's samples from one view: values (n_lights, 3), weights (n_lights,)."""
+    """Add one texel's samples from one view: values (n_lights, 3), weights (n_lights,).
+
+    `channels` (n_lights,) has the bits of those that were measured.
+    """
     n_components = len(right)
     at = np.zeros(plane.shape[1], np.float32)
     for j in range(len(values)):
         if weights[j] == 0:
             continue
         _at_light(plane, light_nodes[j], light_taps[j], at)
-        squares[1] += 3 * weights[j]
         for c in range(3):
+            if not channels[j] >> c & 1:
+                continue
+            squares[1] += weights[j]
             rest = values[j, c] - at[c]
             squares[0] += weights[j] * rest * rest
             for k in range(n_components):
@@ -232,6 +238,17 @@ def _solve_texel(
 
 
 @numba.njit(cache=True, nogil=True)
+def _count_values(weights: Floats, channels: Channels) -> int:
+    """Number of values that were measured, of samples with weight."""
+    count = 0
+    for j in range(len(weights)):
+        if weights[j] != 0:
+            for c in range(3):
+                count += channels[j] >> c & 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
 def _solve_coefficients(
     values: Floats,
     view_nodes: Ints,
@@ -241,6 +258,7 @@ def _solve_coefficients(
     view_weights: Floats,
     light_weights: Floats,
     pairs: Floats,
+    channels: Channels,
     cluster: Ints,
     table: Floats,
     precision: NDArray[np.float64],
@@ -250,6 +268,7 @@ def _solve_coefficients(
     n_components = precision.shape[1]
     plane = np.zeros(table.shape[2:], np.float32)
     lit = np.zeros(table.shape[2], np.int32)
+    every = np.full(values.shape[2], ALL_CHANNELS, np.uint8)
     for t in range(len(values)):
         touched = lit[: _touched(light_nodes[t], light_weights[t], lit)]
         normal = np.zeros((n_components, n_components))
@@ -257,12 +276,14 @@ def _solve_coefficients(
         n_values = 0
         for i in np.flatnonzero(view_weights[t]):
             weights = view_weights[t, i] * light_weights[t] * pairs[i]
-            n_values += 3 * int(np.count_nonzero(weights))
+            measured = channels[t, i] if len(channels) else every
+            n_values += _count_values(weights, measured)
             taps = (view_nodes[t, i], view_taps[t, i])
             _at_view(table[cluster[t]], *taps, touched, plane)
             _add_normal_equations(
                 values[t, i],
                 weights,
+                measured,
                 plane,
                 light_nodes[t],
                 light_taps[t],
@@ -280,6 +301,7 @@ def _solve_coefficients(
 def _spread_view(
     values: Floats,
     weights: Floats,
+    channels: Channels,
     plane: Floats,
     light_nodes: Ints,
     light_taps: Floats,
@@ -299,8 +321,9 @@ def _spread_view(
                 value = np.float32(0)
                 for k in range(len(factor)):
                     value += factor[k] * at[3 * k + c]
+            weight = weights[j] * (channels[j] >> c & 1)
             for k in range(len(factor)):
-                at[3 * k + c] = factor[k] * weights[j] * value
+                at[3 * k + c] = factor[k] * weight * value
         _spread(spread, light_nodes[j], light_taps[j], at)
 
 
@@ -326,6 +349,7 @@ def _accumulate(
     view_weights: Floats,
     light_weights: Floats,
     pairs: Floats,
+    channels: Channels,
     cluster: Ints,
     coefficients: Floats,
     table: Floats,
@@ -337,6 +361,7 @@ def _accumulate(
     spread = np.zeros(table.shape[2:], np.float32)
     factor = np.ones(table.shape[3] // 3, np.float32)
     lit = np.zeros(table.shape[2], np.int32)
+    every = np.full(values.shape[2], ALL_CHANNELS, np.uint8)
     for t in range(len(values)):
         touched = lit[: _touched(light_nodes[t], light_weights[t], lit)]
         factor[1:] = coefficients[t]
@@ -349,6 +374,7 @@ def _accumulate(
             _spread_view(
                 values[t, i],
                 weights,
+                channels[t, i] if len(channels) else every,
                 plane,
                 light_nodes[t],
                 light_taps[t],
@@ -369,6 +395,7 @@ def _arguments(rooted: RootedSamples, part: slice) -> tuple[NDArray[np.generic],
         rooted.view_weights[part],
         rooted.light_weights[part],
         rooted.pairs,
+        rooted.channels[part],
     )
 
 
@@ -411,6 +438,9 @@ class _BasisProblem:
         weight = np.einsum(
             "ti,ij,tj->t", rooted.view_weights, rooted.pairs, rooted.light_weights
         )
+        if rooted.has_gaps:
+            pairs = rooted.pairs * rooted.measured().mean(axis=3, dtype=np.float32)
+            weight = np.einsum("ti,tij,tj->t", rooted.view_weights, pairs, rooted.light_weights)
         total = np.bincount(self.cluster, weight, minlength=n_clusters)
         return np.maximum(total / n_nodes, 1e-6).astype(np.float32)
 

@@ -133,7 +133,10 @@ def _add_texel(
     scale: float,
     normal: Doubles,
 ) -> None:
-    """Add one texel's samples: those of seen views, seen lights and photographed pairs."""
+    """Add one texel's samples: those of seen views, seen lights and photographed pairs.
+
+    NaN was not measured.
+    """
     at_view, jacobian = np.zeros((3, nodes.shape[1], 3)), np.zeros(5)
     right, up = (1, sides[1]) if sides[1] > 1 else (0, 0)
     for i in range(values.shape[0]):
@@ -147,6 +150,8 @@ def _add_texel(
             first = taps[1][j]
             corners = (first, first + right, first + up, first + up + right)
             for c in range(3):
+                if np.isnan(values[i, j, c]):
+                    continue
                 _add_sample(
                     values[i, j, c],
                     at_view,
@@ -284,7 +289,7 @@ def improved_block(
     found = reader.measured(texels)
     frames = reader.local_from_world[texels].astype(np.float64)
     _improve(
-        root(found.samples.astype(np.float32), reader.options.domain),
+        root(found.samples.astype(np.float32) * np.float32(found.unit), reader.options.domain),
         (found.views.astype(np.float64), found.lights.astype(np.float64)),
         (found.view_seen, found.light_seen),
         found.pairs,

@@ -209,20 +209,21 @@ class IndirectModel:
         if not len(self.variances):
             return np.zeros((len(shade.values), 0), np.float32)
         seen = shade.weights > 0
-        brightest = np.where(seen[..., None], shade.values, -np.inf).max(axis=1, keepdims=True)
+        brightest = np.where(seen, shade.values, -np.inf).max(axis=1, keepdims=True)
         # The brightest sample has noise itself.
         limit = np.where(np.isfinite(brightest), brightest + self.noise**0.5, np.inf)
-        known_to = np.maximum((LIMIT_SHARE * limit.max(axis=2)) ** 2, self.noise)
+        largest = np.where(np.isfinite(limit), limit, 0.0).max(axis=2, keepdims=True)
+        known_to = np.maximum((LIMIT_SHARE * largest) ** 2, self.noise)
         harmonics = real_harmonics(shade.lights.reshape(-1, 3), self.band_limit)
-        harmonics = harmonics.reshape(*seen.shape, -1)
+        harmonics = harmonics.reshape(*seen.shape[:2], n_coefficients(self.band_limit))
         means = self._posterior(Systems.of(shade, self.band_limit))
         for _ in range(LIMIT_ROUNDS):
             coefficients = self.mean + means @ self.axes.T
             shown = harmonics @ coefficients.reshape(len(means), -1, 3)
-            beyond = (shown > limit).any(axis=2) & ~seen
+            beyond = ((shown > limit) & ~seen).any(axis=2, keepdims=True) & ~seen
             if not beyond.any():
                 break
-            values = np.where(seen[..., None], shade.values, np.minimum(shown, limit))
+            values = np.where(seen, shade.values, np.minimum(shown, limit))
             weights = shade.weights + beyond * (self.noise / known_to)
             limited = Shade(values.astype(np.float32), weights, shade.lights)
             means = self._posterior(Systems.of(limited, self.band_limit))
@@ -258,18 +259,23 @@ class Systems:
     @classmethod
     def of(cls, shade: Shade, band_limit: int) -> Systems:
         """Sums over the shade of each texel."""
-        n, n_lights = shade.weights.shape
+        n, n_lights, _ = shade.weights.shape
         harmonics = real_harmonics(shade.lights.reshape(-1, 3), band_limit)
         # Not -1: where no texel is in shadow there is nothing to infer it from.
         harmonics = harmonics.reshape(n, n_lights, n_coefficients(band_limit))
-        weighted = harmonics * shade.weights[..., None]
-        one = np.swapaxes(weighted, 1, 2) @ harmonics
-        size = 3 * one.shape[1]
-        gram = np.einsum("nab,cd->nacbd", one, np.eye(3)).reshape(n, size, size)
+        size = harmonics.shape[2]
         values = shade.values.astype(np.float64)
-        moments = (np.swapaxes(weighted, 1, 2) @ values).reshape(n, size)
-        energy = np.einsum("nl,nlc->n", shade.weights, values**2)
-        return cls(gram, moments, energy, 3.0 * (shade.weights > 0).sum(axis=1))
+        gram, moments = np.zeros((n, size, 3, size, 3)), np.zeros((n, size, 3))
+        for c in range(3):
+            weighted = np.swapaxes(harmonics * shade.weights[..., c, None], 1, 2)
+            gram[:, :, c, :, c] = weighted @ harmonics
+            moments[..., c] = (weighted @ values[..., c, None])[..., 0]
+        return cls(
+            gram.reshape(n, 3 * size, 3 * size),
+            moments.reshape(n, 3 * size),
+            np.einsum("nlc,nlc->n", shade.weights, values**2),
+            (shade.weights > 0).sum(axis=(1, 2)).astype(np.float64),
+        )
 
     def divided_by(self, size: float) -> Systems:
         """The same for samples divided by `size`."""

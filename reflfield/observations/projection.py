@@ -15,15 +15,33 @@ from reflfield.capture.model import Capture
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
 from reflfield.observations.store import (
+    UNIT,
     Location,
     chunk_shape,
     create_samples,
     is_written,
+    note_gaps,
     open_samples,
 )
 from reflfield.scheduling import Blocks
 
 Floats = NDArray[np.float32]
+Kinds = NDArray[np.uint8]
+# What a value of a photograph at a texel may be: measured; at the upper limit of sensor or
+# file; at code 0; under alpha 0; of a colour that the light has not; where it gives nothing.
+VALUE_KINDS = ("measured", "saturated", "black", "transparent", "dark", "unlit")
+# Those that say nothing of the sample.
+NOT_MEASURED = ("saturated", "transparent", "dark")
+# Those that do: black is less than the file can say.
+IS_KNOWN = np.array([kind in ("measured", "black") for kind in VALUE_KINDS])
+IS_GAP = np.array([kind in NOT_MEASURED for kind in VALUE_KINDS])
+# A pixel of less weight in a bilinear sample changes it by less than a half float's rounding
+# of eleven bits: what such a pixel is does not matter.
+LEAST_WEIGHT = 2.0**-11
+# Photographs, and texels of each, that the unit of the samples follows from, and the median
+# sample of ordinary captures: a grey of a tenth.
+PHOTOGRAPHS_FOR_UNIT, TEXELS_FOR_UNIT = 16, 1024
+USUAL_SAMPLE = 2.0**-5
 # Largest half float; a mirror-like peak beyond it is held there.
 HALF_MAX = 65504.0
 # Bytes for the photographs that are held at a time.
@@ -138,7 +156,31 @@ class Projection:
         return [range(i, min(i + step, n_views)) for i in range(0, n_views, step)]
 
 
-def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1) -> None:
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """What the projection found in the photographs.
+
+    Parameters
+    ----------
+    photographs : int
+        That were read.
+    values : (n_views, len(VALUE_KINDS)) int64
+        Values of the texels that each camera sees, three for each photograph and texel, by
+        what they are: see `VALUE_KINDS`.
+    measured : (n_texels, n_lights) bool
+        True where some camera measured a value under the light.
+    """
+
+    photographs: int
+    values: NDArray[np.int64]
+    measured: NDArray[np.bool_]
+
+    def count(self, kind: str) -> int:
+        """Values of one kind, all cameras together."""
+        return int(self.values[:, VALUE_KINDS.index(kind)].sum())
+
+
+def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1) -> Projected:
     """Write the samples of all texels: radiance divided by the light's irradiance.
 
     Parameters
@@ -150,19 +192,27 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         Threads for whose blocks there is memory: a block takes the samples of its views and
         `Projection.budget`.
 
+    Returns
+    -------
+    Projected
+
     Raises
     ------
     CaptureError
         If a photograph cannot be read.
     ShapeError
         If shapes disagree.
+    InputError
+        If the store holds other samples.
 
     Notes
     -----
-    Every photograph is read once.
+    Every photograph is read once, a few of them (`PHOTOGRAPHS_FOR_UNIT`) before, to choose the
+    unit of the samples.
     """
-    create_samples(projection.location, *projection.shape)
-    blocks.map(
+    chosen = blocks.once("unit", lambda: {"unit": np.array(sample_unit(projection))})
+    create_samples(projection.location, *projection.shape, float(chosen["unit"]))
+    parts = blocks.map(
         "projecting photographs",
         project_views,
         projection,
@@ -170,24 +220,51 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         intact=has_views,
         at_once=at_once,
     )
+    n_photographs, values = 0, []
+    measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
+    for part in parts:
+        n_photographs += int(part["photographs"])
+        values.append(part["values"])
+        measured |= part["measured"]
+    bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
+    found = Projected(n_photographs, np.concatenate(values), bits)
+    note_gaps(projection.location, any(found.count(kind) for kind in NOT_MEASURED))
+    return found
 
 
 def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any]]:
-    """Write the samples of a few views; gives the number of photographs read."""
+    """Write the samples of a few views; gives the number of photographs read, and of values."""
     points = np.asarray(projection.positions, np.float64)
     n_lights = projection.capture.n_lights
     block = np.zeros((len(points), len(views), n_lights, 3), np.float16)
+    counts = np.zeros((len(views), len(VALUE_KINDS)), np.int64)
+    measured = np.zeros((len(points), n_lights), np.bool_)
+    store = open_samples(projection.location)
+    unit = float(store.attrs[UNIT])
     n_read = 0
     for i, view in enumerate(views):
         seen = np.flatnonzero(projection.visible[:, view])
-        for lights, values in _view_samples(
+        for lights, values, kinds in _view_samples(
             projection.capture, view, points[seen], projection.budget
         ):
-            block[seen[:, None], i, lights] = values
+            stored = np.clip(values / np.float32(unit), -HALF_MAX, HALF_MAX)
+            block[seen[:, None], i, lights] = stored.astype(np.float16)
+            counts[i] += _counts_of(kinds)
+            measured[seen[:, None], lights] |= IS_KNOWN[kinds].any(axis=2)
             n_read += len(lights)
-    store = open_samples(projection.location)
     store[:, views.start : views.stop] = block
-    return {"photographs": np.array(n_read)}
+    return {
+        "photographs": np.array(n_read),
+        "values": counts,
+        "measured": np.packbits(measured, axis=1),
+    }
+
+
+def _counts_of(kinds: Kinds) -> NDArray[np.int64]:
+    """Values of each kind; most photographs have one."""
+    if kinds.any():
+        return np.bincount(kinds.ravel(), minlength=len(VALUE_KINDS)).astype(np.int64)
+    return np.array([kinds.size] + [0] * (len(VALUE_KINDS) - 1), np.int64)
 
 
 def has_views(projection: Projection, views: range) -> bool:
@@ -196,10 +273,44 @@ def has_views(projection: Projection, views: range) -> bool:
     return is_written(store, (slice(None), slice(views.start, views.stop)))
 
 
+def sample_unit(projection: Projection) -> float:
+    """Unit in which halves hold the samples of a capture: a power of 64.
+
+    Cube and square root of such a power are powers of two, so that no digit changes whatever
+    the domain of the factorization is. Samples of ordinary captures, whose median is near
+    `USUAL_SAMPLE`, are stored as they are, in units of 1.
+
+    Parameters
+    ----------
+    projection : Projection
+        A few of its photographs are looked at, evenly spread over the capture.
+
+    Returns
+    -------
+    float
+    """
+    capture, n = projection.capture, len(projection.capture.photographs)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
+    found = [np.zeros(0, np.float32)]
+    for photograph in (capture.photographs[i] for i in chosen):
+        seen = np.flatnonzero(projection.visible[:, photograph.camera])
+        some = seen[:: max(1, len(seen) // TEXELS_FOR_UNIT)]
+        points = np.asarray(projection.positions[some], np.float64)
+        pixels, _ = capture.cameras[photograph.camera].project(points)
+        lights = np.array([photograph.light])
+        values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
+        found.append(values[(kinds == 0) & (values > 0)])
+    positive = np.concatenate(found)
+    if not len(positive):
+        return 1.0
+    size = float(np.median(positive.astype(np.float64)))
+    return float(64.0 ** np.round(np.log2(size / USUAL_SAMPLE) / 6.0))
+
+
 def _view_samples(
     capture: Capture, view: int, points: NDArray[np.float64], budget: int
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float16]]]:
-    """Samples of one view, some lights at a time: (lights, (n_points, n, 3))."""
+) -> Iterator[tuple[NDArray[np.intp], Floats, Kinds]]:
+    """Samples and kinds (n_points, n, 3) of one view, some lights at a time."""
     pixels, _ = capture.cameras[view].project(points)
     photographed = np.flatnonzero(capture.photograph_index[view] >= 0)
     camera = capture.cameras[view]
@@ -207,16 +318,73 @@ def _view_samples(
     each = 12 * (3 * camera.width * camera.height + 4 * len(points))
     together = int(np.clip(budget // max(each, 1), 1, LIGHTS_AT_ONCE))
     for lights in np.array_split(photographed, max(1, -(-len(photographed) // together))):
-        if not len(lights):
-            continue
-        indices = capture.photograph_index[view, lights]
-        images = np.stack([capture.read_photograph(int(i)) for i in indices])
-        irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
-        # A light may have no blue, a spot may miss a texel: nothing is learned there.
-        lit = irradiance > 0
-        values = sample_bilinear(images, pixels) / np.where(lit, irradiance, 1.0)
-        values = np.clip(np.where(lit, values, 0.0), -HALF_MAX, HALF_MAX)
-        yield lights, values.astype(np.float16)
+        if len(lights):
+            yield lights, *_samples_at(capture, view, lights, points, pixels)
+
+
+def _samples_at(
+    capture: Capture,
+    view: int,
+    lights: NDArray[np.intp],
+    points: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+) -> tuple[Floats, Kinds]:
+    """Samples of one view at the pixels of points, and of what kind each value is."""
+    indices = capture.photograph_index[view, lights]
+    images, kinds = [], np.zeros((len(points), len(lights), 3), np.uint8)
+    for j, index in enumerate(indices):
+        image, measured = capture.read_measured(int(index))
+        images.append(image)
+        if not measured.all():
+            _mark_kinds(pixel_kinds(image, measured), pixels, LEAST_WEIGHT, kinds[:, j])
+    irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
+    # A light may have no blue, a spot may miss a texel: nothing is learned there.
+    lit = irradiance > 0
+    values = sample_bilinear(np.stack(images), pixels)
+    values /= np.where(lit, irradiance, np.float32(1.0))
+    kinds[~lit] = VALUE_KINDS.index("dark")
+    unlit = ~lit.any(axis=2)
+    kinds[unlit] = VALUE_KINDS.index("unlit")
+    # What lies outside a spot's cone follows from the light alone, and stays black.
+    values[unlit] = 0.0
+    if kinds.any():
+        values[IS_GAP[kinds]] = np.nan
+    return values, kinds
+
+
+def pixel_kinds(image: Floats, measured: NDArray[np.bool_]) -> Kinds:
+    """Of what kind each value (h, w, 3) of a photograph is: a place in `VALUE_KINDS`.
+
+    A value that is no measurement is black where it is zero, saturated where it is at least
+    half of the largest of its channel, and else lies under alpha 0.
+    """
+    bright = image >= 0.5 * image.max(axis=(0, 1))
+    kinds = np.full(image.shape, VALUE_KINDS.index("transparent"), np.uint8)
+    kinds[bright] = VALUE_KINDS.index("saturated")
+    kinds[image <= 0] = VALUE_KINDS.index("black")
+    kinds[measured] = 0
+    return kinds
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_kinds(
+    kinds: Kinds, pixels: NDArray[np.float64], least_weight: float, out: Kinds
+) -> None:
+    """Kind (n, 3) of each sampled value: that of its heaviest pixel that is no measurement."""
+    height, width, _ = kinds.shape
+    for i in range(len(pixels)):
+        x = min(max(pixels[i, 0] - 0.5, 0.0), width - 1.0)
+        y = min(max(pixels[i, 1] - 0.5, 0.0), height - 1.0)
+        column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+        s, t = x - column, y - row
+        for c in range(3):
+            most = least_weight
+            for corner in range(4):
+                right, below = corner & 1, corner >> 1
+                weight = (s if right else 1 - s) * (t if below else 1 - t)
+                kind = kinds[min(row + below, height - 1), min(column + right, width - 1), c]
+                if kind != 0 and weight > most:
+                    most, out[i, c] = weight, kind
 
 
 def directions_of(

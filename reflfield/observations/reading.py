@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from reflfield.capture.model import Capture
 from reflfield.observations.projection import directions_of, facing_irradiance
 from reflfield.observations.resampling import (
+    POWERS,
     Nodes,
     ResamplingOptions,
     RootedSamples,
@@ -43,6 +44,8 @@ def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
 
 # Directions of so many are worked out together to count samples.
 TEXELS_COUNTED_AT_ONCE = 1024
+# Samples that are looked through for those not measured.
+COUNTING_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +73,8 @@ class Shade:
     ----------
     values : (n, n_lights, 3) float32
         Mean over the views, in the domain.
-    weights : (n, n_lights) float32
-        Views that show it; 0 where the light reaches the texel.
+    weights : (n, n_lights, 3) float32
+        Views that measured it; 0 where the light reaches the texel.
     lights : (n, n_lights, 3) float32
         Unit vectors, world frame.
     """
@@ -79,6 +82,54 @@ class Shade:
     values: Floats
     weights: Floats
     lights: Floats
+
+
+@dataclass(frozen=True)
+class SampleCount:
+    """Samples that count: those fitted, and those of which no channel was measured."""
+
+    fitted: int
+    unmeasured: int
+
+
+def luminance_of(texels: TexelSamples) -> Floats:
+    """Luminance (n, n_views, n_lights) of samples, in their unit; NaN of no channel.
+
+    Where only some channels were measured the sample is taken to have the colour of its
+    texel: the mean of the samples of which all channels were measured, or, without any, of
+    each channel over the samples that have it. The luminance is what the channels have over
+    the share that they have of that colour's. Where all were measured this is the luminance
+    itself. Leaving such samples out would leave nothing of a capture under coloured lamps;
+    taking the missing channels for black would draw frames after the colours of the lamps.
+
+    Examples
+    --------
+    An orange texel under white light, and the same half as bright under blue light alone:
+
+    >>> samples = np.array([[[[0.4, 0.2, 0.1], [np.nan, np.nan, 0.05]]]])
+    >>> one = np.array([[[0.0, 0, 1]]])
+    >>> seen = np.ones((1, 2), bool)
+    >>> few = TexelSamples(samples, one, one.repeat(2, 1), seen[:, :1], seen, seen[:1])
+    >>> luminance_of(few).round(4)
+    array([[[0.2353, 0.1176]]], dtype=float32)
+    """
+    values = texels.samples.astype(np.float32)
+    if not texels.has_gaps or not (unmeasured := np.isnan(values)).any():
+        return values @ LUMINANCE
+    values = np.where(unmeasured, np.float32(0.0), values)
+    counted = ~unmeasured & texels.seen[..., None]
+    whole_samples = np.asarray(counted.all(axis=3))[..., None]
+    has_whole = np.asarray(whole_samples.any(axis=(1, 2)))[:, None, None]
+    counted = np.where(has_whole, whole_samples, counted)
+    total = np.einsum("nvlc,nvlc->nc", values, counted)
+    colour = total / np.maximum(np.count_nonzero(counted, axis=(1, 2)), 1) * LUMINANCE
+    whole = colour.sum(axis=1)[:, None, None]
+    shown = np.einsum("nvlc,nc->nvl", ~unmeasured, colour)
+    share = np.divide(shown, whole, out=np.zeros_like(shown), where=whole > 0)
+    partial = unmeasured.any(axis=3)
+    known = values @ LUMINANCE
+    scaled = np.divide(known, share, out=np.full_like(known, np.nan), where=share > 0)
+    return np.where(partial, scaled, known).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +169,16 @@ class TexelReader:
         return self.sides[0] ** 2 * self.sides[1] ** 2
 
     @property
+    def domain_unit(self) -> float:
+        """The samples' unit in the domain of the factorization; a power of two as well."""
+        return float(2.0 ** (np.log2(self.store.unit) / POWERS[self.options.domain]))
+
+    @property
+    def weight_channels(self) -> int:
+        """Weights of a pair of nodes: one, or three where values were not measured."""
+        return 3 if self.store.has_gaps else 1
+
+    @property
     def sample_bytes_per_texel(self) -> int:
         """Memory of one texel's samples in the domain, with taps."""
         n_views, n_lights = self.capture.n_views, self.capture.n_lights
@@ -144,6 +205,8 @@ class TexelReader:
             view_seen=view_seen,
             light_seen=light_seen,
             pairs=self.store.observed.pairs,
+            unit=self.store.unit,
+            has_gaps=self.store.has_gaps,
         )
 
     def _seen(self, texels: Indices) -> tuple[Bools, Bools]:
@@ -153,9 +216,12 @@ class TexelReader:
         lit = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
         return observed.views[texels], observed.lights[texels] & lit
 
-    def count_fitted(self, texels: Indices) -> int:
-        """Samples of some texels that count in the reader's frames; none is read."""
-        total = 0
+    def count_fitted(self, texels: Indices) -> SampleCount:
+        """Samples of some texels that count in the reader's frames.
+
+        They are read only where values of some were not measured.
+        """
+        fitted, unmeasured = 0, 0
         for first in range(0, len(texels), TEXELS_COUNTED_AT_ONCE):
             some = texels[first : first + TEXELS_COUNTED_AT_ONCE]
             frames = self.local_from_world[some]
@@ -164,7 +230,20 @@ class TexelReader:
                 for directions in directions_of(self.capture, self.positions[some])
             )
             counts = above_horizon(*self._seen(some), view, light, self.sides)
-            total += Observed(*counts, self.store.observed.pairs).count()
+            observed = Observed(*counts, self.store.observed.pairs)
+            n_gaps = self._count_unmeasured(some, observed) if self.store.has_gaps else 0
+            fitted += observed.count() - n_gaps
+            unmeasured += n_gaps
+        return SampleCount(fitted, unmeasured)
+
+    def _count_unmeasured(self, texels: Indices, observed: Observed) -> int:
+        """Samples of which no channel was measured."""
+        step, total = max(1, COUNTING_BYTES // self.sample_bytes_per_texel), 0
+        for first in range(0, len(texels), step):
+            part = slice(first, first + step)
+            seen = observed.views[part, :, None] & observed.lights[part, None] & observed.pairs
+            nothing = np.isnan(self.store.read(texels[part])).all(axis=3)
+            total += int(np.count_nonzero(nothing & seen))
         return total
 
     def rooted(self, texels: Indices) -> RootedSamples:
@@ -173,10 +252,13 @@ class TexelReader:
         return rooted_samples(self.measured(texels), frames, self.sides, self.options.domain)
 
     def luminance(self, texels: Indices) -> LocalLuminance:
-        """Luminance of the samples of some texels, as measured, and where they stand."""
+        """Luminance of the samples of some texels, as measured, and where they stand.
+
+        See `luminance_of` for samples of which not all channels were measured.
+        """
         found = self.measured(texels)
-        seen = found.view_seen[:, :, None] & found.light_seen[:, None] & found.pairs
-        samples = np.where(seen, found.samples.astype(np.float32) @ LUMINANCE, np.nan)
+        values = luminance_of(found) * np.float32(found.unit)
+        samples = np.where(found.seen, values, np.float32(np.nan))
         frames = self.local_from_world[texels].astype(np.float64)
         views = local_directions(frames, found.views.astype(np.float64))
         lights = local_directions(frames, found.lights.astype(np.float64))
@@ -193,18 +275,21 @@ class TexelReader:
         lit = self.store.observed.lights[texels]
         # Outside a spot's cone there is no light that could come back.
         strong = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
-        weights = views.astype(np.float32) @ self.store.observed.pairs.astype(np.float32)
-        weights = np.where(strong & ~lit, weights, np.float32(0.0))
-        total = np.zeros((*weights.shape, 3), np.float32)
-        t, j = np.nonzero(weights)
+        shadowed = strong & ~lit
+        weights = np.zeros((*shadowed.shape, 3), np.float32)
+        total = np.zeros_like(weights)
+        t, j = np.nonzero(shadowed)
         pairs = self.store.observed.pairs
         samples = self.store.read(texels)
         for i in range(views.shape[1]):
             used = views[t, i] & pairs[i, j]
-            rooted = root(samples[t[used], i, j[used]].astype(np.float32), self.options.domain)
-            total[t[used], j[used]] += rooted
-        means = total / np.maximum(weights, np.float32(1.0))[..., None]
-        return Shade(means.astype(np.float32), weights.astype(np.float32), lights)
+            values = samples[t[used], i, j[used]].astype(np.float32)
+            rooted = root(values * np.float32(self.store.unit), self.options.domain)
+            measured = ~np.isnan(rooted)
+            weights[t[used], j[used]] += measured
+            total[t[used], j[used]] += np.where(measured, rooted, np.float32(0.0))
+        means = total / np.maximum(weights, np.float32(1.0))
+        return Shade(means.astype(np.float32), weights, lights)
 
     def nodes(self, texels: Indices) -> Nodes:
         """Texels resampled onto the nodes of their frames."""
@@ -239,12 +324,18 @@ class NodeColumns:
         return self.reader.n_pairs * 3, len(self.texels)
 
     def read(self, columns: Indices) -> tuple[Floats, Floats]:
-        """Values (n_rows, k) and weights (n_rows // 3, k) of some columns."""
+        """Values (n_rows, k) and weights of some columns.
+
+        Weights have a row for each pair of nodes, or, where values were not measured, for each
+        row of the values.
+        """
         chosen = self.texels[columns]
         order = np.argsort(chosen)
         nodes = self.reader.nodes(chosen[order])
         back = np.argsort(order)
-        k = len(chosen)
-        values = nodes.values.reshape(k, -1)[back].T
-        weights = nodes.weights.reshape(k, -1)[back].T
-        return values, weights
+        k, channels = len(chosen), self.reader.weight_channels
+        weights = nodes.weights
+        if channels == 3 and weights.ndim == 3:
+            # Of these texels everything was measured.
+            weights = np.repeat(weights[..., None], 3, axis=3)
+        return nodes.values.reshape(k, -1)[back].T, weights.reshape(k, -1)[back].T

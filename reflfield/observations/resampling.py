@@ -16,7 +16,7 @@ A node counts as observed as far as directions actually seen lie near it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeVar
 
@@ -32,6 +32,7 @@ Doubles = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
+Channels = NDArray[np.uint8]
 Directions = TypeVar("Directions", NDArray[np.float32], NDArray[np.float64])
 
 POWERS = {"cube_root": 3.0, "square_root": 2.0, "linear": 1.0}
@@ -166,8 +167,9 @@ class Nodes:
         In the domain, without the light's cosine; smooth continuation where not observed.
     view_support, light_support : (n, n_nodes) float32
         Share in [0, 1] to which each node was observed.
-    pair_support : (n, n_view_nodes, n_light_nodes) float32, optional
-        Summed interpolation weight of the pairs photographed; None where all were.
+    pair_support : (n, n_view_nodes, n_light_nodes[, 3]) float32, optional
+        Summed interpolation weight of the pairs photographed, of each channel where values
+        were not measured; None where all were.
     """
 
     values: Floats
@@ -177,9 +179,16 @@ class Nodes:
 
     @property
     def weights(self) -> Floats:
-        """(n, n_view_nodes, n_light_nodes) share to which each pair of nodes is observed."""
+        """Share to which each pair of nodes, and channel where they differ, is observed.
+
+        (n, n_view_nodes, n_light_nodes[, 3]).
+        """
         product = self.view_support[:, :, None] * self.light_support[:, None, :]
-        return product if self.pair_support is None else np.minimum(product, self.pair_support)
+        if self.pair_support is None:
+            return product
+        if self.pair_support.ndim == 4:
+            product = product[..., None]
+        return np.minimum(product, self.pair_support)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,13 +198,17 @@ class TexelSamples:
     Parameters
     ----------
     samples : (n, n_views, n_lights, 3) float
-        Radiance over facing irradiance.
+        Radiance over facing irradiance, over `unit`.
     views, lights : (n, n_directions, 3) float32
         Unit directions in the world frame.
     view_seen, light_seen : (n, n_directions) bool
         Which count.
     pairs : (n_views, n_lights) bool
         Which were photographed.
+    unit : float
+        What the samples are in, 1/sr.
+    has_gaps : bool
+        Whether values of samples that count may be NaN: not measured.
     """
 
     samples: NDArray[np.floating]
@@ -204,6 +217,13 @@ class TexelSamples:
     view_seen: Bools
     light_seen: Bools
     pairs: Bools
+    unit: float = 1.0
+    has_gaps: bool = True
+
+    @property
+    def seen(self) -> Bools:
+        """(n, n_views, n_lights) True where the texel is seen, lit and photographed."""
+        return self.view_seen[:, :, None] & self.light_seen[:, None] & self.pairs
 
 
 def local_directions(local_from_world: Directions, directions: Directions) -> Directions:
@@ -220,6 +240,16 @@ def local_directions(local_from_world: Directions, directions: Directions) -> Di
     return directions @ np.swapaxes(local_from_world, 1, 2)
 
 
+# Bits of `RootedSamples.channels`, and all of them.
+CHANNEL_BITS = np.array([1, 2, 4], np.uint8)
+ALL_CHANNELS = 7
+
+
+def all_channels() -> Channels:
+    """What stands for texels of which every channel was measured."""
+    return np.zeros((0, 0, 0), np.uint8)
+
+
 @dataclass(frozen=True, eq=False)
 class RootedSamples:
     """Samples in the domain with interpolation taps and weights in the texels' frames.
@@ -234,6 +264,8 @@ class RootedSamples:
         What a sample weighs is the product of the two and of its pair.
     pairs : (n_views, n_lights) float32
         1 where photographed.
+    channels : (n, n_views, n_lights) uint8, optional
+        Bit c is set where channel c was measured; without texels: all, as in most captures.
     """
 
     values: Floats
@@ -242,6 +274,18 @@ class RootedSamples:
     view_weights: Floats
     light_weights: Floats
     pairs: Floats
+    channels: Channels = field(default_factory=all_channels)
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether some channel was not measured."""
+        return len(self.channels) > 0
+
+    def measured(self) -> Bools:
+        """(n, n_views, n_lights, 3) which channels were measured."""
+        if not self.has_gaps:
+            return np.ones(self.values.shape, np.bool_)
+        return (self.channels[..., None] & CHANNEL_BITS) > 0
 
 
 def rooted_samples(
@@ -282,7 +326,14 @@ def rooted_samples(
     # A third of the samples count at a dome: only these are brought into the domain.
     t, i, j = np.nonzero(view_seen[:, :, None] & light_seen[:, None] & texels.pairs)
     values = np.zeros(texels.samples.shape, np.float32)
-    ratio = texels.samples[t, i, j].astype(np.float32) / safe[t, j][:, None]
+    ratio = texels.samples[t, i, j].astype(np.float32) * np.float32(texels.unit)
+    ratio /= safe[t, j][:, None]
+    channels = all_channels()
+    unmeasured = np.isnan(ratio) if texels.has_gaps else np.zeros(0, np.bool_)
+    if unmeasured.any():
+        channels = np.zeros(values.shape[:3], np.uint8)
+        channels[t, i, j] = ~unmeasured @ CHANNEL_BITS
+        ratio[unmeasured] = 0.0
     values[t, i, j] = root(ratio, domain)
     return RootedSamples(
         values=values,
@@ -291,6 +342,7 @@ def rooted_samples(
         view_weights=view_seen.astype(np.float32),
         light_weights=light_seen * safe ** np.float32(2.0 / POWERS[domain]),
         pairs=texels.pairs.astype(np.float32),
+        channels=channels,
     )
 
 
@@ -344,7 +396,8 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
     -----
     Two solves per texel, of the size of the number of views and of lights that count. Pairs
     that were never photographed are filled from the fit, `FILLING_SWEEPS` times, and count as
-    observed only as far as photographed ones lie near them.
+    observed only as far as photographed ones lie near them. Of a texel of which some values
+    were not measured each channel is resampled by itself, from its own views and lights.
     """
     n, n_nodes = len(rooted.values), (sides[0] ** 2, sides[1] ** 2)
     values = np.zeros((n, *n_nodes, 3), np.float32)
@@ -356,14 +409,15 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
         (prior_covariance(sides[0], smoothness), prior_covariance(sides[1], smoothness)),
         (1 if sides[0] == 1 else 4, 1 if sides[1] == 1 else 4),
         rooted.pairs > 0,
-        0 if rooted.pairs.all() else FILLING_SWEEPS,
+        rooted.channels,
+        FILLING_SWEEPS,
         values,
         supports,
     )
     for support in supports:
         np.minimum(support, 1.0, out=support)
         support[support < LEAST_SUPPORT] = 0.0
-    if rooted.pairs.all():
+    if rooted.pairs.all() and not rooted.has_gaps:
         return Nodes(values, *supports)
     to_views = interpolation_matrices(rooted.view_taps, sides[0])
     to_lights = interpolation_matrices(rooted.light_taps, sides[1])
@@ -372,14 +426,23 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
 
 @numba.njit(cache=True, nogil=True)
 def _gather_taps(
-    nodes: Ints, taps: Floats, counted: Indices, n_taps: int, n_nodes: int, support: Floats
+    nodes: Ints, taps: Floats, counted: Indices, n_taps: int, support: Floats
+) -> None:
+    """Add the weights of the directions that count to the nodes' support."""
+    for direction in counted:
+        for tap in range(n_taps):
+            support[nodes[direction, tap]] += taps[direction, tap]
+
+
+@numba.njit(cache=True, nogil=True)
+def _dense_taps(
+    nodes: Ints, taps: Floats, counted: Indices, n_taps: int, n_nodes: int
 ) -> Floats:
-    """Interpolation (k, n_nodes) at the directions that count; adds to the nodes' support."""
+    """Interpolation (k, n_nodes) at the directions that count."""
     dense = np.zeros((len(counted), n_nodes), np.float32)
     for i, direction in enumerate(counted):
         for tap in range(n_taps):
             dense[i, nodes[direction, tap]] += taps[direction, tap]
-            support[nodes[direction, tap]] += taps[direction, tap]
     return dense
 
 
@@ -424,16 +487,17 @@ def _operator(
 @numba.njit(cache=True, nogil=True)
 def _both(left: Floats, right: Floats, values: Floats, out: Floats) -> None:
     """Left @ values @ right^T for each channel: (a, b), (c, d), (b, d, 3) to (a, c, 3)."""
+    n_channels = values.shape[2]
     a, (c, d) = left.shape[0], right.shape
-    halfway = (left @ values.reshape(-1, 3 * d)).reshape(a, d, 3)
-    folded = np.zeros((a, 3, d), np.float32)
+    halfway = (left @ values.reshape(-1, n_channels * d)).reshape(a, d, n_channels)
+    folded = np.zeros((a, n_channels, d), np.float32)
     for i in range(a):
         for j in range(d):
-            for channel in range(3):
+            for channel in range(n_channels):
                 folded[i, channel, j] = halfway[i, j, channel]
-    found = (folded.reshape(3 * a, d) @ right.T).reshape(a, 3, c)
+    found = (folded.reshape(n_channels * a, d) @ right.T).reshape(a, n_channels, c)
     for i in range(a):
-        for channel in range(3):
+        for channel in range(n_channels):
             for j in range(c):
                 out[i, j, channel] = found[i, channel, j]
 
@@ -443,16 +507,16 @@ def _weighted_mean(
     values: Floats,
     counted: tuple[Indices, Indices],
     weights: tuple[Floats, Floats],
-    pairs: Bools,
+    measured: Bools,
 ) -> Floats:
-    """Mean (3,) of one texel's samples: where the filling starts."""
-    total, weight = np.zeros(3), 1e-6
+    """Mean (n_channels,) of one texel's samples: where the filling starts."""
+    total, weight = np.zeros(values.shape[2]), 1e-6
     for i in counted[0]:
         for j in counted[1]:
-            if pairs[i, j]:
+            if measured[i, j]:
                 share = weights[0][i] * weights[1][j]
                 weight += share
-                for channel in range(3):
+                for channel in range(values.shape[2]):
                     total[channel] += share * values[i, j, channel]
     return (total / weight).astype(np.float32)
 
@@ -465,59 +529,134 @@ def _resample_texels(
     priors: tuple[Doubles, Doubles],
     n_taps: tuple[int, int],
     pairs: Bools,
+    channels: Channels,
     n_sweeps: int,
     out: Floats,
     supports: tuple[Floats, Floats],
 ) -> None:
     """Fill nodes (n, n_view_nodes, n_light_nodes, 3) and supports, texel by texel."""
     for t in range(len(values)):
-        view, light = np.flatnonzero(weights[0][t]), np.flatnonzero(weights[1][t])
-        sizes = (len(priors[0]), len(priors[1]))
-        to_view = _gather_taps(
-            taps[0][0][t], taps[0][1][t], view, n_taps[0], sizes[0], supports[0][t]
-        )
-        to_light = _gather_taps(
-            taps[1][0][t], taps[1][1][t], light, n_taps[1], sizes[1], supports[1][t]
-        )
-        if len(view) == 0 or len(light) == 0:
+        counted = (np.flatnonzero(weights[0][t]), np.flatnonzero(weights[1][t]))
+        for k in range(2):
+            nodes, shares = taps[k]
+            _gather_taps(nodes[t], shares[t], counted[k], n_taps[k], supports[k][t])
+        if len(counted[0]) == 0 or len(counted[1]) == 0:
             continue
-        of_view = _operator(
-            taps[0][0][t], taps[0][1][t], weights[0][t], view, priors[0], n_taps[0]
-        )
-        of_light = _operator(
-            taps[1][0][t], taps[1][1][t], weights[1][t], light, priors[1], n_taps[1]
-        )
-        mean = _weighted_mean(values[t], (view, light), (weights[0][t], weights[1][t]), pairs)
-        own = np.zeros((len(view), len(light), 3), np.float32)
-        expected = np.zeros_like(own) + mean
-        _take(values[t], (view, light), pairs, expected, own)
-        _both(of_view, of_light, own, out[t])
-        for _ in range(n_sweeps):
-            _both(to_view, to_light, out[t], expected)
-            _take(values[t], (view, light), pairs, expected, own)
-            _both(of_view, of_light, own, out[t])
+        own_taps = ((taps[0][0][t], taps[0][1][t]), (taps[1][0][t], taps[1][1][t]))
+        own_weights = (weights[0][t], weights[1][t])
+        if len(channels) == 0 or _whole(channels[t], counted, pairs):
+            _resample_channels(
+                values[t],
+                own_taps,
+                own_weights,
+                priors,
+                n_taps,
+                counted,
+                pairs,
+                n_sweeps,
+                out[t],
+            )
+            continue
+        for c in range(3):
+            measured = pairs & ((channels[t] & (1 << c)) > 0)
+            of_channel = _with_any(measured, counted)
+            if len(of_channel[0]) == 0:
+                continue
+            one = np.zeros((out.shape[1], out.shape[2], 1), np.float32)
+            _resample_channels(
+                values[t, :, :, c : c + 1],
+                own_taps,
+                own_weights,
+                priors,
+                n_taps,
+                of_channel,
+                measured,
+                n_sweeps,
+                one,
+            )
+            out[t, :, :, c] = one[:, :, 0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _whole(channels: Channels, counted: tuple[Indices, Indices], pairs: Bools) -> bool:
+    """Whether every channel of every sample that counts was measured."""
+    for i in counted[0]:
+        for j in counted[1]:
+            if pairs[i, j] and channels[i, j] != ALL_CHANNELS:
+                return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _with_any(measured: Bools, counted: tuple[Indices, Indices]) -> tuple[Indices, Indices]:
+    """Views and lights that count and of which something was measured."""
+    views = np.zeros(measured.shape[0], np.bool_)
+    lights = np.zeros(measured.shape[1], np.bool_)
+    for i in counted[0]:
+        for j in counted[1]:
+            if measured[i, j]:
+                views[i] = lights[j] = True
+    return np.flatnonzero(views), np.flatnonzero(lights)
+
+
+@numba.njit(cache=True, nogil=True)
+def _resample_channels(
+    values: Floats,
+    taps: tuple[tuple[Ints, Floats], tuple[Ints, Floats]],
+    weights: tuple[Floats, Floats],
+    priors: tuple[Doubles, Doubles],
+    n_taps: tuple[int, int],
+    counted: tuple[Indices, Indices],
+    measured: Bools,
+    n_sweeps: int,
+    out: Floats,
+) -> None:
+    """Nodes of one texel from its measured samples (n_views, n_lights, n_channels)."""
+    of_view = _operator(taps[0][0], taps[0][1], weights[0], counted[0], priors[0], n_taps[0])
+    of_light = _operator(taps[1][0], taps[1][1], weights[1], counted[1], priors[1], n_taps[1])
+    own = np.zeros((len(counted[0]), len(counted[1]), values.shape[2]), np.float32)
+    expected = np.zeros_like(own) + _weighted_mean(values, counted, weights, measured)
+    n_missing = _take(values, counted, measured, expected, own)
+    _both(of_view, of_light, own, out)
+    if n_missing == 0:
+        return
+    to_view = _dense_taps(taps[0][0], taps[0][1], counted[0], n_taps[0], len(priors[0]))
+    to_light = _dense_taps(taps[1][0], taps[1][1], counted[1], n_taps[1], len(priors[1]))
+    for _ in range(n_sweeps):
+        _both(to_view, to_light, out, expected)
+        _take(values, counted, measured, expected, own)
+        _both(of_view, of_light, own, out)
 
 
 @numba.njit(cache=True, nogil=True)
 def _take(
     values: Floats,
     counted: tuple[Indices, Indices],
-    pairs: Bools,
+    measured: Bools,
     expected: Floats,
     own: Floats,
-) -> None:
-    """Samples that count, and what is expected of pairs that were not photographed."""
+) -> int:
+    """Samples that count, and what is expected of those not measured, whose number it gives."""
+    n_missing = 0
     for i, view in enumerate(counted[0]):
         for j, light in enumerate(counted[1]):
-            own[i, j] = values[view, light] if pairs[view, light] else expected[i, j]
+            if measured[view, light]:
+                own[i, j] = values[view, light]
+            else:
+                own[i, j] = expected[i, j]
+                n_missing += 1
+    return n_missing
 
 
 def _pair_support(rooted: RootedSamples, to_views: Floats, to_lights: Floats) -> Floats:
-    """Interpolation weight (n, n_view_nodes, n_light_nodes) of the pairs photographed."""
+    """Interpolation weight (n, n_view_nodes, n_light_nodes[, 3]) of what was measured."""
     seen = (rooted.view_weights > 0)[:, :, None] & (rooted.light_weights > 0)[:, None]
     counted = (seen * rooted.pairs)[..., None]
+    if rooted.has_gaps:
+        counted = counted * rooted.measured()
     support = apply_both(np.swapaxes(to_views, 1, 2), np.swapaxes(to_lights, 1, 2), counted)
-    return np.where(support < LEAST_SUPPORT, np.float32(0), support)[..., 0]
+    support = np.where(support < LEAST_SUPPORT, np.float32(0), support)
+    return support if rooted.has_gaps else support[..., 0]
 
 
 def apply_both(left: Floats, right: Floats, values: Floats) -> Floats:

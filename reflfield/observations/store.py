@@ -3,13 +3,19 @@
 A store is one zarr array of shape (n_texels, n_views, n_lights, 3), half floats, in chunks
 of some texels and some views, in a folder or in object storage. Chunks are written whole or
 not at all and carry a CRC-32C. Which samples count follows from three small arrays beside
-it: the views and lights that each texel sees, and the pairs that were photographed.
+it: the views and lights that each texel sees, and the pairs that were photographed. Of a
+sample that counts, a value that was not measured is NaN: the light has none of that colour, or
+the pixel was saturated. What no writer has written is minus infinity, which no sample is.
+
+Stored is the sample over the array's `unit`, a power of two near the capture's own samples, so
+that halves hold them whatever the units of radiance, intensity and length are.
 """
 
 from __future__ import annotations
 
 import atexit
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -36,6 +42,10 @@ CHUNK_BYTES = 1 << 20
 VIEWS_PER_CHUNK = 8
 WRITER_BYTES = 128 << 20
 SAMPLE_BYTES = 6
+# What chunks hold that were never written.
+UNWRITTEN = -np.inf
+# Attributes of the array: what its numbers are in, and whether values that count may be NaN.
+UNIT, GAPS = "unit", "gaps"
 # How long a process that ends waits for zarr's thread; zarr waits for 0.2 s, then raises.
 ENDING_SECONDS = 10.0
 
@@ -131,6 +141,16 @@ class ObservationStore:
         """(n_texels, n_views, n_lights, 3) float16 on disk."""
         return open_samples(self.location, mode="r")
 
+    @cached_property
+    def unit(self) -> float:
+        """What the stored numbers are in, 1/sr; a power of two."""
+        return float(self.samples.attrs.get(UNIT, 1.0))
+
+    @cached_property
+    def has_gaps(self) -> bool:
+        """Whether some values of samples that count were not measured, and are NaN."""
+        return bool(self.samples.attrs.get(GAPS, True))
+
     @property
     def n_texels(self) -> int:
         """Number of texels."""
@@ -142,7 +162,7 @@ class ObservationStore:
         return int(self.samples.chunks[0])
 
     def read(self, texels: slice | NDArray[np.integer]) -> NDArray[np.float16]:
-        """Samples (k, n_views, n_lights, 3) of some texels.
+        """Samples (k, n_views, n_lights, 3) of some texels, over `unit`; NaN: not measured.
 
         Parameters
         ----------
@@ -166,7 +186,7 @@ def checked_read(
 ) -> NDArray[np.float16]:
     """Rows of an array of halves, (k, ...).
 
-    A chunk that is missing reads as NaN, which is looked for in its first entries.
+    A chunk that is missing reads as `UNWRITTEN`, which is looked for in its first entries.
 
     Raises
     ------
@@ -183,7 +203,7 @@ def checked_read(
         ) from error
     found = np.asarray(found)
     first = (slice(None), *(slice(None, None, step) for step in array.chunks[1:]))
-    if np.isnan(found[first]).any():
+    if np.isneginf(found[first]).any():
         raise InputError(
             f"{location}: expected all chunks, found some missing; compute the stage again "
             "with --from"
@@ -212,7 +232,7 @@ def opened(location: Location) -> str | FsspecStore:
 
 
 def create_samples(
-    location: Location, n_texels: int, n_views: int, n_lights: int
+    location: Location, n_texels: int, n_views: int, n_lights: int, unit: float = 1.0
 ) -> zarr.Array:
     """Create an array of samples, or open the one that an interrupted run began.
 
@@ -222,6 +242,8 @@ def create_samples(
     ----------
     location : Path or str
     n_texels, n_views, n_lights : int
+    unit : float
+        What the numbers are in, 1/sr.
 
     Returns
     -------
@@ -243,29 +265,43 @@ def create_samples(
     try:
         found = _opened_array(location, "r+")
     except FileNotFoundError:
-        return _created(location, shape, chunks)
+        return _created(location, shape, chunks, unit)
     if (found.shape, found.chunks, str(found.dtype)) != (shape, chunks, "float16"):
         raise InputError(
             f"{location}: expected float16 samples of shape {shape} in chunks {chunks}, found "
             f"{found.dtype} of shape {found.shape} in chunks {found.chunks}; remove it, or use "
             "another place"
         )
+    if found.attrs.get(UNIT) != unit:
+        raise InputError(
+            f"{location}: expected samples in units of {unit}, found {found.attrs.get(UNIT)}; "
+            "remove it, or use another place"
+        )
     return found
 
 
-def _created(location: Location, shape: tuple[int, ...], chunks: tuple[int, ...]) -> zarr.Array:
+def _created(
+    location: Location, shape: tuple[int, ...], chunks: tuple[int, ...], unit: float
+) -> zarr.Array:
     with naming(str(location)):
         return zarr.create_array(
             opened(location),
             shape=shape,
             chunks=chunks,
             dtype="float16",
-            fill_value=np.nan,
+            fill_value=UNWRITTEN,
+            attributes={UNIT: unit},
             compressors=[BloscCodec(cname="lz4", clevel=1, shuffle="shuffle", typesize=2),
                          Crc32cCodec()],
             config={"write_empty_chunks": True},
             overwrite=False,
         )  # fmt: skip
+
+
+def note_gaps(location: Location, has_gaps: bool) -> None:
+    """Note with finished samples whether values of those that count were not measured."""
+    with naming(str(location)):
+        open_samples(location).attrs[GAPS] = has_gaps
 
 
 def open_samples(location: Location, mode: Literal["r", "r+"] = "r+") -> zarr.Array:
@@ -309,4 +345,4 @@ def is_written(array: zarr.Array, part: tuple[slice, ...]) -> bool:
     except ValueError:
         return False
     first = tuple(slice(None, None, step) for step in array.chunks)
-    return not np.isnan(found[first]).any()
+    return not np.isneginf(found[first]).any()

@@ -30,6 +30,7 @@ def accounts_of(job: Job) -> Iterator[Account]:
     """
     counts = {record.name: record.counts for record in job.stages.records}
     yield _photographs(job, counts["observations"])
+    yield _values(job, counts["observations"])
     yield _samples(job, counts)
     yield from _texels(job, counts)
     yield _frames(job)
@@ -56,6 +57,7 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
     shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
     unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
     used = counts["compression"]["samples fitted"]
+    unmeasured = counts["compression"]["samples not measured"]
     shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
     mixed = shade["samples at edges of shadows"]
     shown = shade["samples in shadow"] - mixed
@@ -69,11 +71,32 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
             "in shadow: fitted as indirect light": shown,
             "in shadow: at its edge": mixed,
             "in shadow: nothing made of them": int(shadowed) - shown - mixed,
+            "not measured in any channel": unmeasured,
             "below the horizon of the texel's frame, or outside the light's cone": counts[
                 "completion"
             ]["samples observed"]
-            - used,
+            - used
+            - unmeasured,
         },
+    )
+
+
+def _values(job: Job, projected: dict[str, Any]) -> Account:
+    """Three values for each photograph and texel that its camera sees: measured or not."""
+    pairs = job.observed.pairs.sum(axis=1)
+    names = {
+        "measured": "measured",
+        "saturated": "saturated: left out",
+        "black": "at code 0, darker than the file can say: taken for black",
+        "transparent": "under alpha 0: left out",
+        "dark": "of a colour that the light has not: left out",
+        "unlit": "the light gives nothing there",
+    }
+    return Account(
+        "observations",
+        "values",
+        3 * int(job.view_seen.sum(axis=0) @ pairs),
+        {name: projected[f"values {kind}"] for kind, name in names.items()},
     )
 
 

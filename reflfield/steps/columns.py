@@ -59,10 +59,11 @@ class BlockedColumns:
         return NodeColumns(self.reader, self.texels)
 
     def read(self, columns: Indices) -> tuple[Floats, Floats]:
-        """Values (n_rows, k) and weights (n_rows // 3, k) of some columns."""
+        """Values (n_rows, k) and weights (n_weights, k) of some columns."""
         rows = self.shape[0]
         values = np.zeros((len(columns), rows), np.float32)
-        weights = np.zeros((len(columns), rows // 3), np.float32)
+        n_weights = self.reader.n_pairs * self.reader.weight_channels
+        weights = np.zeros((len(columns), n_weights), np.float32)
         step = texels_at_once(self.reader, self.block_bytes)
         for first in range(0, len(columns), step):
             part = slice(first, first + step)
@@ -79,21 +80,25 @@ class HalfColumns:
     ----------
     values : (n_columns, n_rows) float16
         An array, or the file of one.
-    weights : (n_columns, n_rows // 3) float16
+    weights : (n_columns, n_weights) float16
     shape : (int, int)
         Rows and columns.
+    n_weights : int
+        Of a column: as many as rows, or one for three of them.
+    unit : float
+        What the values are in; a power of two.
     """
 
     values: Halves | Path
     weights: Halves | Path
     shape: tuple[int, int]
+    n_weights: int
+    unit: float
 
     def read(self, columns: Indices) -> tuple[Floats, Floats]:
-        """Values (n_rows, k) and weights (n_rows // 3, k) of some columns."""
-        rows = self.shape[0]
-        return self._read(self.values, rows, columns), self._read(
-            self.weights, rows // 3, columns
-        )
+        """Values (n_rows, k) and weights (n_weights, k) of some columns."""
+        values = self._read(self.values, self.shape[0], columns) * np.float32(self.unit)
+        return values, self._read(self.weights, self.n_weights, columns)
 
     def _read(self, stored: Halves | Path, rows: int, columns: Indices) -> Floats:
         if isinstance(stored, Path):
@@ -117,7 +122,7 @@ class Resampling:
     block_bytes: int
 
     def columns(self, texels: Indices) -> tuple[Floats, Floats]:
-        """Values (n_rows, k) and weights (n_rows // 3, k) of some texels."""
+        """Values (n_rows, k) and weights (n_weights, k) of some texels."""
         source = BlockedColumns(self.reader, texels, self.block_bytes)
         return source.read(np.arange(len(texels)))
 
@@ -125,7 +130,8 @@ class Resampling:
 def resampled_halves(context: Resampling, texels: Indices) -> dict[str, Halves]:
     """Resampled texels as rows of halves: a block of `half_columns`."""
     values, weights = context.columns(texels)
-    return {"values": values.T.astype(np.float16), "weights": weights.T.astype(np.float16)}
+    values = values.T / np.float32(context.reader.domain_unit)
+    return {"values": values.astype(np.float16), "weights": weights.T.astype(np.float16)}
 
 
 def half_columns(
@@ -150,11 +156,12 @@ def half_columns(
     HalfColumns
         The same values in both cases.
     """
-    n, rows = len(texels), context.reader.n_pairs * 3
+    reader, n = context.reader, len(texels)
+    widths = (reader.n_pairs * 3, reader.n_pairs * reader.weight_channels)
     parts = [texels[i : i + COLUMNS_AT_ONCE] for i in range(0, n, COLUMNS_AT_ONCE)]
     found = blocks.map("resampling for the basis", resampled_halves, context, parts)
-    fits = n * (rows + rows // 3) * 2 <= memory
-    kept = [np.zeros((n if fits else 0, width), np.float16) for width in (rows, rows // 3)]
+    fits = n * sum(widths) * 2 <= memory
+    kept = [np.zeros((n if fits else 0, width), np.float16) for width in widths]
     paths = (folder / "values", folder / "weights")
     for i, part in enumerate(found):
         for array, path, name in zip(kept, paths, ("values", "weights"), strict=True):
@@ -165,7 +172,7 @@ def half_columns(
                 with path.open("ab") as file:
                     block.tofile(file)
     values, weights = kept if fits else paths
-    return HalfColumns(values, weights, (rows, n))
+    return HalfColumns(values, weights, (widths[0], n), widths[1], reader.domain_unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +195,11 @@ def inferred(context: Inference, texels: Indices) -> dict[str, Floats]:
     for some in blocks_of(texels, COLUMNS_AT_ONCE):
         # Row by row, as the arithmetic goes.
         values, weights = map(np.ascontiguousarray, context.texels.columns(some))
-        found, _ = infer_coefficients(context.completion, values, weights=weights, n_channels=3)
+        found, _ = infer_coefficients(
+            context.completion,
+            values,
+            weights=weights,
+            n_channels=3 // context.texels.reader.weight_channels,
+        )
         parts.append(found)
     return {"coefficients": np.concatenate(parts)}

@@ -40,13 +40,16 @@ def shade_block(context: Shading, texels: NDArray[np.intp]) -> dict[str, Any]:
     """Shade of some texels, one sample for each light."""
     found = context.reader.shade(texels)
     # Views agree but for noise, the model errs more: one sample, however many there are.
-    used = (found.weights > 0) & ~context.at_edge[texels]
+    inside = ~context.at_edge[texels]
+    used = (found.weights > 0) & inside[..., None]
+    # Of views that have measured any channel.
+    n_views = found.weights.max(axis=2)
     return {
-        "values": found.values.astype(np.float16),
+        "values": (found.values / np.float32(context.reader.domain_unit)).astype(np.float16),
         "weights": used.astype(np.float32),
         "lights": found.lights,
-        "samples": np.array(found.weights.sum(dtype=np.float64)),
-        "used": np.array((found.weights * used).sum(dtype=np.float64)),
+        "samples": np.array(n_views.sum(dtype=np.float64)),
+        "used": np.array((n_views * inside).sum(dtype=np.float64)),
     }
 
 
@@ -62,13 +65,14 @@ def write_indirect(job: Job, folder: Path) -> dict[str, Any]:
     n_samples, n_used = (
         sum(float(part[name]) for part in parts) for name in ("samples", "used")
     )
-    in_shade = np.flatnonzero(shade.weights.any(axis=1))
+    in_shade = np.flatnonzero(shade.weights.any(axis=(1, 2)))
     rng = np.random.default_rng(job.options.seed)
     n = min(len(in_shade), options.training_texels)
     chosen = np.sort(rng.choice(in_shade, n, replace=False))
 
     def read(texels: NDArray[np.intp]) -> Shade:
-        arrays = (shade.values[texels], shade.weights[texels], shade.lights[texels])
+        values = shade.values[texels].astype(np.float32) * np.float32(reader.domain_unit)
+        arrays = (values, shade.weights[texels], shade.lights[texels])
         return replace(shade, **dict(zip(("values", "weights", "lights"), arrays, strict=True)))
 
     model = fit_indirect(read, chosen, job.training.n_lights, options.n_components)

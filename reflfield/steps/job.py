@@ -23,6 +23,7 @@ from reflfield.observations.reading import TexelReader, grid_sides
 from reflfield.observations.store import Location, ObservationStore, Observed
 from reflfield.scheduling import Blocks, Scheduler
 from reflfield.stages import RESTARTABLE, StageFolder, key_of
+from reflfield.steps.clipping import MEASURED, stored_measured
 from reflfield.steps.holding_out import Split, split_of
 from reflfield.steps.options import PipelineOptions
 
@@ -198,10 +199,16 @@ class Job:
         )
 
     @cached_property
-    def seen_texels(self) -> NDArray[np.intp]:
-        """Texels with at least one sample."""
+    def sampled(self) -> NDArray[np.bool_]:
+        """(n_texels, n_lights) True where a camera sees the texel under a light that counts."""
         pairs = self.observed.views.astype(np.float32) @ self.observed.pairs.astype(np.float32)
-        return np.flatnonzero((pairs * self.observed.lights).any(axis=1))
+        return np.asarray(pairs * self.observed.lights > 0)
+
+    @cached_property
+    def seen_texels(self) -> NDArray[np.intp]:
+        """Texels with at least one sample of which something was measured."""
+        measured = stored_measured(self.result("observations", MEASURED))
+        return np.flatnonzero((self.sampled & measured).any(axis=1))
 
     @cached_property
     def texels_in_view(self) -> NDArray[np.intp]:

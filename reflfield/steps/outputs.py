@@ -103,7 +103,7 @@ def averages_block(context: Averaging, texels: NDArray[np.intp]) -> dict[str, An
     for first in range(texels[0], texels[-1] + 1, context.step):
         part = slice(first, min(first + context.step, texels[-1] + 1))
         seen = observed.views[part, :, None] & observed.lights[part, None, :] & observed.pairs
-        parts.append(mean_sample(context.store.read(part), seen))
+        parts.append(mean_sample(context.store.read(part), seen) * context.store.unit)
     return {"averages": np.concatenate(parts).astype(np.float32)}
 
 

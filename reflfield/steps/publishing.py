@@ -161,9 +161,7 @@ def publish_records(job: Job, last: str, *, whole: bool) -> None:
     folder = job.out / OUTDATED
     left = [p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()]
     if left:
-        log.warning(
-            "%s: made from other stages than now: %s", folder, ", ".join(sorted(left))
-        )
+        log.warning("%s: made from other stages than now: %s", folder, ", ".join(sorted(left)))
 
 
 def published(job: Job) -> list[Path]:

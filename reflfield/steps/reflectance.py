@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +31,11 @@ from reflfield.field.file import open_field, write_field
 from reflfield.field.fit import (
     ClusteredModel,
 )
-from reflfield.observations.projection import Projection, project_photographs
+from reflfield.observations.projection import (
+    VALUE_KINDS,
+    Projection,
+    project_photographs,
+)
 from reflfield.observations.reading import LUMINANCE, TexelReader
 from reflfield.observations.resampling import unroot
 from reflfield.observations.store import open_samples
@@ -38,6 +43,7 @@ from reflfield.scheduling import Blocks
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
 from reflfield.stages import plain
+from reflfield.steps.clipping import check_measured, clipping_lines, write_measured
 from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
 from reflfield.steps.fitting import AlignedFrames, Resampled, fitted_model, local_frames
 from reflfield.steps.job import ELSEWHERE, Job
@@ -48,6 +54,8 @@ from reflfield.steps.quantising import FieldMaker
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
+logger = logging.getLogger(__name__)
+
 # Share of the memory that the columns of a completion may take while it is fitted.
 COLUMNS_SHARE = 1 / 3
 # In the results of the resampling: coefficients of all texels, beside those of the completion.
@@ -57,17 +65,22 @@ REFINEMENT = RefinementOptions(side=25, rounds=4, texels_per_cluster=8192)
 
 
 def write_observations(job: Job, folder: Path) -> dict[str, Any]:
-    """Apparent BRDF samples of all texels, on disk."""
+    """Apparent BRDF samples of all texels, on disk; what of them was not measured is told."""
     location = job.new_samples_location(folder)
     projection = Projection(
         job.training, job.texels.position, job.view_seen, location, job.resources.block_bytes
     )
-    project_photographs(projection, job.blocks(folder), writers_at_once(job))
+    found = project_photographs(projection, job.blocks(folder), writers_at_once(job))
+    check_measured(job.training, found)
+    write_measured(folder, found.measured)
+    for line in clipping_lines(job.training, found):
+        logger.warning("%s", line)
     n_samples = job.view_seen.size * job.training.n_lights
     return {
-        "photographs": len(job.training.photographs),
+        "photographs": found.photographs,
         "samples": n_samples,
         "raw bytes": n_samples * 6,
+        **{f"values {kind}": found.count(kind) for kind in VALUE_KINDS},
     }
 
 
@@ -143,7 +156,12 @@ def completed(
                 blocks, context, chosen, int(resources.max_memory * COLUMNS_SHARE), Path(folder)
             )
             found = complete(
-                columns, rank=rank, passes=passes, method=method, n_channels=3, seed=seed
+                columns,
+                rank=rank,
+                passes=passes,
+                method=method,
+                n_channels=3 // reader.weight_channels,
+                seed=seed,
             )
         return arrays_of(found)
 
@@ -475,10 +493,12 @@ def write_compressed(found: Resampled, maker: FieldMaker, folder: Path) -> dict[
     raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
     error = sample_error(made, job.base_reader, job.seen_texels)
     n_fitted = len(job.seen_texels)
+    counted = reader.count_fitted(np.flatnonzero(job.sampled.any(axis=1)))
     return {
         "texels fitted": n_fitted,
         "texels that repeat another": made.n_texels - n_fitted,
-        "samples fitted": reader.count_fitted(job.seen_texels),
+        "samples fitted": counted.fitted,
+        "samples not measured": counted.unmeasured,
         "clusters": made.n_clusters,
         "components": made.n_components,
         "field bytes": size,

@@ -203,9 +203,7 @@ BOMBS = {
             "asset": {"version": "2.0"},
             "buffers": [{"uri": "../secret.bin", "byteLength": 12}],
             "bufferViews": [{"buffer": 0, "byteLength": 12}],
-            "accessors": [
-                {"bufferView": 0, "count": 1, "type": "VEC3", "componentType": 5126}
-            ],
+            "accessors": [{"bufferView": 0, "count": 1, "type": "VEC3", "componentType": 5126}],
             "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
             "nodes": [{"mesh": 0}],
             "scenes": [{"nodes": [0]}],

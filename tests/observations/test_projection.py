@@ -13,6 +13,7 @@ from reflfield.errors import InputError, ShapeError
 from reflfield.observations import store
 from reflfield.observations.projection import (
     HALF_MAX,
+    USUAL_SAMPLE,
     Projection,
     directions_of,
     facing_irradiance,
@@ -69,7 +70,8 @@ def project(tmp_path):
         project_photographs(projection, Blocks(Scheduler(), folder / "blocks"))
         lights = np.ones((len(positions), capture.n_lights), bool)
         observed = Observed(visible, lights, pairs_photographed(capture))
-        return ObservationStore(folder / "store", observed).read(slice(None))
+        stored = ObservationStore(folder / "store", observed)
+        return stored.read(slice(None)).astype(np.float64) * stored.unit
 
     return run
 
@@ -175,13 +177,16 @@ class TestProjection:
         capture = capture_of(images, [Light("l0", "directional")], {(0, 0)})
         assert project(capture, np.zeros((1, 3)))[0, :, 0, 0].tolist() == [0, 1]
 
-    def test_light_without_blue_and_spot_that_misses(self, capture_of, project):
+    def test_light_without_blue_measures_none_and_a_spot_that_misses_gives_none(
+        self, capture_of, project
+    ):
         beam = {"direction": [1, 0, 0], "cone_angle": 0.1, "falloff_angle": 0.1}
         spot = Light("l1", "spot", position=[0, 0, 1], **beam)
         capture = capture_of(
             np.ones((1, 2, HEIGHT, WIDTH, 3)), [lamp("l0", 1, [1, 1, 0]), spot]
         )
-        assert project(capture, [[0, 0, 0]])[0, 0].tolist() == [[1, 1, 0], [0, 0, 0]]
+        got = project(capture, [[0, 0, 0]])[0, 0]
+        assert np.array_equal(got, [[1, 1, np.nan], [0, 0, 0]], equal_nan=True)
 
     def test_order_of_texels(self, capture_of, project, rng):
         images = rng.random((2, 2, HEIGHT, WIDTH, 3))
@@ -202,22 +207,40 @@ class TestProjection:
         assert np.array_equal(scaled, one)
 
     @pytest.mark.stability
-    @pytest.mark.parametrize("exponent", [-13, -4, 0, 4, 14])
-    def test_samples_scale_within_the_range_of_halves(self, capture_of, project, rng, exponent):
-        """Exact for powers of two between the smallest normal half, 2^-14, and the largest."""
-        images = rng.uniform(0.5, 1, (1, 1, HEIGHT, WIDTH, 3)).astype(np.float32)
+    @pytest.mark.parametrize("exponent", [-120, -37, -13, -1, 0, 4, 14, 41, 110])
+    def test_samples_scale_with_the_capture(self, capture_of, project, rng, exponent):
+        """Exact for powers of two within floats: halves hold samples over their unit."""
+        images = rng.uniform(2e-3, 1, (1, 1, HEIGHT, WIDTH, 3)).astype(np.float32)
         sun = [Light("l0", "directional")]
         positions = rng.uniform(-2, 2, size=(20, 3))
-        one = project(capture_of(images, sun), positions).astype(np.float64)
+        one = project(capture_of(images, sun), positions)
         scaled = project(capture_of(images * 2.0**exponent, sun), positions)
         assert np.array_equal(scaled, one * 2.0**exponent)
 
     @pytest.mark.stability
-    @pytest.mark.parametrize(("scale", "expected"), [(1e12, HALF_MAX), (1e-12, 0.0)])
-    def test_beyond_the_range_of_halves(self, capture_of, project, scale, expected):
-        images = np.full((1, 1, HEIGHT, WIDTH, 3), scale)
-        got = project(capture_of(images, [Light("l0", "directional")]), [[0, 0, 0]])
-        assert (got == expected).all()
+    @pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e7, 1e12])
+    def test_no_sample_clips_or_underflows(self, capture_of, project, rng, scale):
+        """Of five decades around the usual sample: a highlight, and a shade."""
+        images = 10.0 ** rng.uniform(-4, 2, (1, 1, HEIGHT, WIDTH, 3))
+        sun = [Light("l0", "directional", intensity=[scale] * 3)]
+        y, x = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
+        centres = np.stack([x + 0.5 - WIDTH / 2, HEIGHT / 2 - y - 0.5, 0 * x], axis=1)
+        got = project(capture_of(images, sun), centres)[:, 0, 0]
+        # Halves round to eleven bits, and float32 once before; below 2^-14 of the unit, which
+        # is within a factor of 8 of the median over `USUAL_SAMPLE`, to 2^-25 of it.
+        least = 2.0**-25 * 8 * np.median(images) / USUAL_SAMPLE
+        np.testing.assert_allclose(
+            got * scale, images[0, 0].reshape(-1, 3), rtol=2**-10.9, atol=least
+        )
+
+    @pytest.mark.stability
+    def test_peaks_beyond_the_range_of_halves_are_held_there(self, capture_of, project):
+        images = np.full((1, 1, HEIGHT, WIDTH, 3), 2.0**-5)
+        images[..., 0, 0, :] = 1e9
+        corner = [0.5 - WIDTH / 2, HEIGHT / 2 - 0.5, 0]
+        capture = capture_of(images, [Light("l0", "directional")])
+        got = project(capture, [corner, [0, 0, 0], [1, 0, 0]])
+        assert got[:, 0, 0, 0].tolist() == [HALF_MAX, 2.0**-5, 2.0**-5]
 
     def test_shapes(self, capture_of, tmp_path):
         capture = capture_of(np.ones((1, 1, HEIGHT, WIDTH, 3)), [lamp("l0")])
@@ -257,8 +280,9 @@ def test_camera_that_images_nothing_is_named(capture_of, tmp_path):
     capture = capture_of(np.ones((1, 1, HEIGHT, WIDTH, 3)), [lamp("l0")])
     perspective = replace(capture.cameras[0], kind="opencv")
     behind = replace(capture, cameras=(perspective,))
+    projection = Projection(
+        behind, np.array([[0, 0, 5.0]]), np.ones((1, 1), bool), tmp_path / "s"
+    )
+    store.create_samples(projection.location, *projection.shape)
     with pytest.raises(InputError, match="pixels"):
-        project_views(
-            Projection(behind, np.array([[0, 0, 5.0]]), np.ones((1, 1), bool), tmp_path / "s"),
-            range(1),
-        )
+        project_views(projection, range(1))

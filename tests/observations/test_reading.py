@@ -7,7 +7,7 @@ from reflfield.capture.lights import Light
 from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import NodeColumns, TexelReader, grid_sides
 from reflfield.observations.resampling import ResamplingOptions, root
-from reflfield.observations.store import ObservationStore, Observed, create_samples
+from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 from .rigs import dome, tilted_frames
@@ -23,6 +23,7 @@ def reader_of(tmp_path, rng):
         n = len(samples)
         stored = create_samples(tmp_path / "store", n, capture.n_views, capture.n_lights)
         stored[:] = samples.astype(np.float16)
+        note_gaps(tmp_path / "store", bool(np.isnan(samples).any()))
         seen = {
             "views": np.ones((n, capture.n_views), bool),
             "lights": np.ones((n, capture.n_lights), bool),
@@ -216,6 +217,6 @@ class TestShade:
         for k, t in enumerate(texels):
             for j in range(5):
                 seen = views[t] if not lights[t, j] else np.zeros(4, bool)
-                assert shade.weights[k, j] == seen.sum()
+                assert (shade.weights[k, j] == seen.sum()).all()
                 expected = stored[t, seen, j].mean(axis=0) if seen.any() else np.zeros(3)
                 np.testing.assert_allclose(shade.values[k, j], expected, rtol=1e-6)

@@ -26,11 +26,13 @@ def finished_job(run_copy, tiny_capture, tiny_options):
 
 def test_all_accounts_add_up(finished_job):
     accounts = {(a.stage, a.things): a for a in accounts_of(finished_job)}
-    assert [account.missing for account in accounts.values()] == [0] * 6
+    assert [account.missing for account in accounts.values()] == [0] * 7
     photographs = accounts["observations", "photographs"]
     assert photographs.total == 60
     # One of ten views and one of six lights: 9 x 5 projected, the pair compared, 5 + 9 apart.
     assert list(photographs.parts.values()) == [45, 1, 14]
+    values = accounts["observations", "values"]
+    assert values.total == values.parts["measured"] == 3 * 5 * finished_job.view_seen.sum()
     samples = accounts["compression", "samples"]
     assert samples.total == 45 * len(finished_job.texels)
     assert accounts["comparison", "frames"].total == 3
@@ -52,7 +54,8 @@ def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):
 
 @pytest.mark.parametrize(
     ("stage", "count"),
-    [("observations", "photographs"), ("completion", "texels completed"),
+    [("observations", "photographs"), ("observations", "values measured"),
+     ("completion", "texels completed"),
      ("alignment", "texels aligned"), ("compression", "texels fitted"),
      ("completion", "samples observed")],
 )  # fmt: skip
