@@ -7,18 +7,22 @@ skipped when neither has changed, written whole or not at all, and resumed after
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from reflfield.capture.model import Capture
+from reflfield.code_digests import code_digest
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
+from reflfield.file_digests import FileDigests
 from reflfield.folders import only_run
 from reflfield.progress import report
+from reflfield.stages import plain
 from reflfield.steps import (
     choices,
     evaluation,
@@ -33,6 +37,13 @@ from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
 from reflfield.steps.quantising import held_out
+
+# In the folder of the stages: digests of the files that were read.
+FILES_INDEX = "files.json"
+# Of the options of rendering, what no picture depends on.
+RENDERING_RESOURCES = ("workers", "block_pixels")
+# In the folder of a simulated capture.
+TRUTH = "truth"
 
 
 @dataclass(frozen=True)
@@ -73,6 +84,7 @@ class Stage:
             options=self.options(job.options),
             inputs=self.reads(job),
             after={name: job.stages.key(name) for name in before},
+            code=code_digest(self.compute.__module__),
             intact=lambda folder: self.intact(job, folder),
         )
 
@@ -84,7 +96,36 @@ def field_metadata_digest(job: Job) -> dict[str, str]:
 
 def frames_digests(job: Job) -> dict[str, str]:
     """Digests of the frames that fields are compared on."""
-    return {name: frames.digest() for name, frames in evaluation.frame_sets(job).items()}
+    sets = evaluation.frame_sets(job)
+    return {name: job.digest_of(frames) for name, frames in sets.items()}
+
+
+def truth_digest(job: Job) -> dict[str, str]:
+    """Digest of all files of the truth that a simulated capture brings."""
+    total, files = hashlib.sha256(), sorted((job.capture.root / TRUTH).rglob("*"))
+    for path in files:
+        if path.is_file():
+            total.update(path.relative_to(job.capture.root).as_posix().encode())
+            total.update(job.digests.digest(path))
+    job.digests.save()
+    return {TRUTH: total.hexdigest()} if files else {}
+
+
+def relit_with(options: PipelineOptions) -> dict[str, Any]:
+    """Options of rendering that a picture depends on."""
+    said = asdict(options.relighting)
+    return {name: value for name, value in said.items() if name not in RENDERING_RESOURCES}
+
+
+def shown(options: PipelineOptions) -> dict[str, Any]:
+    """Options as the report lists them."""
+    return {**plain(options), "relighting": relit_with(options)}
+
+
+def read_by_report(job: Job) -> dict[str, str]:
+    """What the report shows besides the results of the stages."""
+    words = {f"choice {i}": text for i, text in enumerate(choices.words_of(job))}
+    return {**field_metadata_digest(job), **truth_digest(job), **words}
 
 
 def try_candidates(job: Job, folder: Path) -> Mapping[str, Any]:
@@ -109,7 +150,7 @@ ORDER = (
     Stage(
         "silhouettes",
         surface.write_silhouettes,
-        reads=lambda job: {"capture": job.training.digest(("cameras", "silhouettes"))},
+        reads=lambda job: {"capture": job.digest_of(job.training, "cameras", "silhouettes")},
     ),
     # silhouettes -> watertight mesh that encloses the object
     Stage(
@@ -117,7 +158,7 @@ ORDER = (
         surface.write_hull,
         after=("silhouettes",),
         options=lambda options: options.hull,
-        reads=lambda job: {"lights": job.training.digest(("lights",))},
+        reads=lambda job: {"lights": job.digest_of(job.training, "lights")},
     ),
     # mesh -> UV charts -> texel table
     Stage(
@@ -138,7 +179,7 @@ ORDER = (
         "observations",
         reflectance.write_observations,
         after=("visibility",),
-        reads=lambda job: {"photographs": job.training.digest(("photographs",))},
+        reads=lambda job: {"photographs": job.digest_of(job.training, "photographs")},
         intact=reflectance.lost_observations,
     ),
     # what is open is settled by trials on the held-out frames
@@ -152,7 +193,7 @@ ORDER = (
             options.resampling,
             options.alignment,
             options.compression,
-            options.relighting,
+            relit_with(options),
             options.seed,
         ),
         reads=lambda job: {"name": job.capture.name, **frames_digests(job)},
@@ -215,7 +256,7 @@ ORDER = (
         "comparison",
         evaluation.write_comparison,
         after=("compression", "without_alignment"),
-        options=lambda options: options.relighting,
+        options=relit_with,
         reads=frames_digests,
     ),
     # what bits bring: the models quantised more and more coarsely
@@ -223,7 +264,7 @@ ORDER = (
         "rate_distortion",
         rate_distortion.write_rate_distortion,
         after=("compression", "without_alignment"),
-        options=lambda options: options.relighting,
+        options=relit_with,
         reads=frames_digests,
         wanted=lambda job: job.options.shows_rate_distortion,
     ),
@@ -232,7 +273,8 @@ ORDER = (
         "report",
         outputs.write_report_page,
         after=("choices", "maps", "comparison", "rate_distortion"),
-        reads=lambda job: {f"choice {i}": text for i, text in enumerate(choices.words_of(job))},
+        options=shown,
+        reads=read_by_report,
     ),
 )
 STAGES = tuple(stage.name for stage in ORDER)
@@ -292,6 +334,7 @@ def run(
         hold_out or HoldOut(),
         resources or Resources(),
         redo,
+        digests=FileDigests(out / "stages" / FILES_INDEX),
     )
     check_memory(job)
     choices.check_choices(job)

@@ -16,6 +16,8 @@ ROOMS = (
     "files",
     "folders",
     "checksums",
+    "code_digests",
+    "file_digests",
     "progress",
     "config",
     "cluster",

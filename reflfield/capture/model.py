@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,12 +29,15 @@ from reflfield.capture.image_files import (
 from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.silhouettes import silhouette_from_photographs
 from reflfield.errors import CaptureError
+from reflfield.file_digests import file_digest
 
 HULL = "hull"
 PLANE = "plane"
 # Lights beyond these add nothing to the mean that a silhouette is made from.
 SILHOUETTE_SAMPLE = 32
 
+# SHA-256 of a file; the type is that of an error to raise.
+FileDigest: TypeAlias = Callable[[Path, type[CaptureError]], bytes]
 DIGEST_PARTS = ("cameras", "lights", "silhouettes", "photographs")
 
 
@@ -315,7 +318,9 @@ class Capture:
             photographs=kept,
         )
 
-    def digest(self, parts: Iterable[str] = DIGEST_PARTS) -> str:
+    def digest(
+        self, parts: Iterable[str] = DIGEST_PARTS, of_file: FileDigest = file_digest
+    ) -> str:
         """SHA-256 of what the capture says and what its files hold.
 
         Parameters
@@ -323,6 +328,8 @@ class Capture:
         parts : iterable of {"cameras", "lights", "silhouettes", "photographs"}
             What to include. Where no silhouette file is given, the photographs it is made
             from stand in for it.
+        of_file : callable, optional
+            ``of_file(path, error)``: SHA-256 of a file, which may know it already.
 
         Returns
         -------
@@ -337,36 +344,38 @@ class Capture:
         for part in DIGEST_PARTS:
             if part in wanted:
                 total.update(part.encode())
-                for piece in self._described(part):
+                for piece in self._described(part, of_file):
                     total.update(piece)
         return total.hexdigest()
 
-    def _described(self, part: str) -> Iterator[bytes]:
+    def _described(self, part: str, of_file: FileDigest) -> Iterator[bytes]:
         """Bytes that stand for one part of the capture."""
         if part == "cameras":
             yield from (_camera_text(c).encode() for c in self.cameras)
         elif part == "lights":
             yield from (_light_text(light).encode() for light in self.lights)
-            yield from (_file_digest(light.file) for light in self.lights if light.file)
+            yield from (
+                of_file(light.file, CaptureError) for light in self.lights if light.file
+            )
         elif part == "silhouettes":
             for view, path in enumerate(self.silhouettes):
                 if path is not None:
-                    yield _file_digest(path)
+                    yield of_file(path, CaptureError)
                 else:
-                    yield from self._silhouette_sources(view)
+                    yield from self._silhouette_sources(view, of_file)
         else:
             for photograph in self.photographs:
                 yield f"{photograph.name} {photograph.camera} {photograph.light}".encode()
                 for exposure in photograph.exposures:
                     yield f"{exposure.seconds} {exposure.reading}".encode()
-                    yield _file_digest(exposure.path)
+                    yield of_file(exposure.path, CaptureError)
 
-    def _silhouette_sources(self, view: int) -> Iterator[bytes]:
+    def _silhouette_sources(self, view: int, of_file: FileDigest) -> Iterator[bytes]:
         """Bytes that stand for the photographs that a silhouette is made from."""
         of_view = [i for i, p in enumerate(self.photographs) if p.camera == view]
         for i in self._with_alpha(view) if self.base_geometry == PLANE else of_view:
             for exposure in self.photographs[i].exposures:
-                yield str(exposure.reading).encode() + _file_digest(exposure.path)
+                yield str(exposure.reading).encode() + of_file(exposure.path, CaptureError)
 
 
 def usual_base_geometry(n_views: int) -> str:
@@ -505,12 +514,3 @@ def _light_text(light: Light) -> str:
     numbers += [light.convention, light.world_from_environment.tolist()]
     numbers += [_light_text(member) for member in light.members]
     return f"{light.id} {light.kind} {numbers}"
-
-
-def _file_digest(path: Path) -> bytes:
-    """SHA-256 of a file; the bytes are streamed."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").digest()
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from error

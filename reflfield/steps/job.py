@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.model import PLANE, Capture
+from reflfield.capture.model import DIGEST_PARTS, PLANE, Capture
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
 from reflfield.field.indirect import IndirectLight
+from reflfield.file_digests import FileDigests
 from reflfield.files import load_arrays
 from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import Mesh, read_ply
@@ -52,6 +53,8 @@ class Job:
         With "auto" where `options` say what it has come to; None before that.
     folders : StageFolder, optional
         Of the stages; by default, new ones in `out`.
+    digests : FileDigests, optional
+        Of the files that are read.
     """
 
     capture: Capture
@@ -62,11 +65,18 @@ class Job:
     redo: frozenset[str] = frozenset()
     asked: PipelineOptions | None = None
     folders: StageFolder | None = None
+    digests: FileDigests = field(default_factory=FileDigests)
 
     @cached_property
     def stages(self) -> StageFolder:
         """Folders of the stages."""
         return self.folders or StageFolder(self.out / "stages", set(self.redo))
+
+    def digest_of(self, capture: Capture, *parts: str) -> str:
+        """Digest of parts of a capture, of all without any; see `Capture.digest`."""
+        digest = capture.digest(parts or DIGEST_PARTS, self.digests.digest)
+        self.digests.save()
+        return digest
 
     @property
     def asked_options(self) -> PipelineOptions:
