@@ -52,6 +52,17 @@ FollowLinks = Annotated[
     bool,
     typer.Option("--follow-links", help="Read files that symbolic links lead to elsewhere."),
 ]
+EncodingOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="linear|srgb|gamma=N|PAIRS.csv",
+        help="Of the photographs, instead of what the files say.",
+    ),
+]
+LayerOption = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Layer, part or page of the photographs' files."),
+]
 Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
 Samples = Annotated[int, typer.Option(help="Rays per pixel, a square number.")]
 
@@ -201,6 +212,8 @@ def run(
     ] = None,
     format: Format = None,
     follow_links: FollowLinks = False,
+    encoding: EncodingOption = None,
+    layer: LayerOption = None,
 ) -> None:
     """Make a relightable field of a capture, with a report.
 
@@ -216,7 +229,10 @@ def run(
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own
         capture, out = capture.resolve(), out.resolve()
-    opened = open_capture(capture, format, follow_links=follow_links, test_split=held.test)
+    reading = image_reading(encoding, layer)
+    opened = open_capture(
+        capture, format, follow_links=follow_links, test_split=held.test, reading=reading
+    )
     with showing_progress(GOES_ON):
         job = run_pipeline(
             opened, out, options, hold_out=held, resources=resources, first=from_, last=until
@@ -369,6 +385,8 @@ def compare(
     workers: Workers = 0,
     format: Format = None,
     follow_links: FollowLinks = False,
+    encoding: EncodingOption = None,
+    layer: LayerOption = None,
 ) -> None:
     """Relight frames and measure them against their photographs."""
     from reflfield.capture.readers import open_capture
@@ -377,11 +395,10 @@ def compare(
     from reflfield.steps.standalone import write_standalone_comparison
 
     options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
-    opened = open_field(field)
+    opened, reading = open_field(field), image_reading(encoding, layer)
     with showing_progress():
-        comparison = write_standalone_comparison(
-            opened, open_capture(frames, format, follow_links=follow_links), out, options
-        )
+        photographed = open_capture(frames, format, follow_links=follow_links, reading=reading)
+        comparison = write_standalone_comparison(opened, photographed, out, options)
     say_metrics(comparison.to_dict())
     say(f"metrics   {out / 'metrics.json'}")
     say(f"report    {out / 'report' / 'index.html'}")
@@ -392,6 +409,8 @@ def inspect(
     path: Annotated[Path, typer.Argument(help="A capture or a field.rfld.")],
     format: Format = None,
     follow_links: FollowLinks = False,
+    encoding: EncodingOption = None,
+    layer: LayerOption = None,
 ) -> None:
     """Say what a capture or a field holds."""
     if path.suffix.lower() == ".rfld":
@@ -403,12 +422,23 @@ def inspect(
         from reflfield.capture.inspect import describe
         from reflfield.capture.readers import open_capture
 
-        lines = describe(open_capture(path, format, follow_links=follow_links)).lines()
+        reading = image_reading(encoding, layer)
+        capture = open_capture(path, format, follow_links=follow_links, reading=reading)
+        lines = describe(capture).lines()
     for line in lines:
         say(line)
 
 
 # --- helpers ------------------------------------------------------------------------------
+
+
+def image_reading(encoding: str | None, layer: str | None) -> Any:
+    """How the photographs are read, as far as options say it."""
+    from reflfield.capture.encoding import parse_encoding
+    from reflfield.capture.image_files import ImageReading
+
+    curve = parse_encoding(encoding) if encoding is not None else None
+    return ImageReading(encoding=curve, layer=layer)
 
 
 def n_workers(wanted: int) -> int:

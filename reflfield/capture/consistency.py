@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from reflfield.capture.model import Capture
+from pathlib import Path
+
+from reflfield.capture.image_files import image_orientation, image_size
+from reflfield.capture.model import Capture, check_matches
 from reflfield.errors import CaptureError
 
 
@@ -73,3 +76,62 @@ def unphotographed(capture: Capture) -> tuple[str, ...]:
                 f"{' ...' if len(idle) > 5 else ''} ({len(idle)} of {totals[what]})"
             )
     return tuple(notes)
+
+
+def check_photographs(capture: Capture) -> None:
+    """Demand that photographs and silhouettes exist and have their camera's size.
+
+    Only headers are read.
+
+    Raises
+    ------
+    CaptureError
+        Naming the first missing or mismatched file and how many there are.
+    """
+    missing = [e.path for p in capture.photographs for e in p.exposures if not e.path.is_file()]
+    if missing:
+        total = sum(len(p.exposures) for p in capture.photographs)
+        raise CaptureError(
+            f"{missing[0]}: photograph missing ({len(missing)} of {total} files are); "
+            "copy them or remove them from the description"
+        )
+    for photograph in capture.photographs:
+        camera = capture.cameras[photograph.camera]
+        for exposure in photograph.exposures:
+            size = image_size(exposure.path, exposure.reading)
+            check_matches(exposure.path, camera, *size)
+    _check_orientations(capture)
+    for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
+        if path is not None:
+            check_matches(path, camera, *image_size(path))
+
+
+def check_environments(capture: Capture) -> None:
+    """Demand that every environment map exists.
+
+    Raises
+    ------
+    CaptureError
+        Naming the light and the file.
+    """
+    for light in capture.lights:
+        if light.file is not None and not light.file.is_file():
+            raise CaptureError(
+                f"{light.file}: environment map of light {light.id!r} missing; copy it there"
+            )
+
+
+def _check_orientations(capture: Capture) -> None:
+    """Demand that no camera has photographs that a viewer would turn differently."""
+    first: dict[int, tuple[int, Path]] = {}
+    for photograph in capture.photographs:
+        for exposure in photograph.exposures:
+            turn = image_orientation(exposure.path)
+            known, path = first.setdefault(photograph.camera, (turn, exposure.path))
+            if turn != known:
+                raise CaptureError(
+                    f"{exposure.path}: expected Exif orientation {known} as {path.name} of the "
+                    f"same camera {capture.cameras[photograph.camera].id!r} has, received "
+                    f"{turn}; pixels are read as stored, so turn the files alike and remove "
+                    "the entry"
+                )

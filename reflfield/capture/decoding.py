@@ -33,6 +33,8 @@ RAW_HINT = "pip install 'reflfield[raw]' to have it developed, or convert it to 
 _FLOATS = ("half", "float", "double")
 _INTEGERS = ("uint8", "uint16", "uint")
 
+LARGEST_CODES = {"uint8": 255, "uint16": 65535}
+
 # One process may read in many threads of its own.
 oiio.attribute("threads", 1)
 oiio.attribute("exr_threads", -1)  # none but the caller's
@@ -69,13 +71,13 @@ class StoredImage:
     @property
     def largest_code(self) -> int:
         """What a code is divided by; 1 of values."""
-        codes = self.colour.dtype in (np.uint8, np.uint16)
-        return int(np.iinfo(self.colour.dtype).max) if codes else 1
+        return LARGEST_CODES.get(self.colour.dtype.name, 1)
 
     @property
     def values(self) -> Float32:
         """Colour with 1 for the largest code, (h, w, channels) float32."""
-        return self.colour.astype(np.float32) / np.float32(self.largest_code)
+        top = self.largest_code
+        return self.colour if top == 1 else self.colour.astype(np.float32) / np.float32(top)
 
 
 def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
@@ -107,7 +109,8 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
         names = layer.colour or _colour_names(path, spec)
         alpha = layer.alpha or _alpha_name(spec)
         _check_pixels(path, header, layer, spec)
-        pixels = _pixels(path, file, header, layer, [*names, *([alpha] if alpha else [])])
+        wanted = [*names, *([alpha] if alpha else [])]
+        pixels = _pixels(path, file, spec, header, layer, wanted)
         space = stated_space(
             path,
             header,
@@ -170,14 +173,14 @@ def _exr_reader(header: ImageHeader, layer: Layer) -> Iterator[None]:
 
 
 def _pixels(
-    path: Path, file: Any, header: ImageHeader, layer: Layer, names: list[str]
+    path: Path, file: Any, spec: Any, header: ImageHeader, layer: Layer, names: list[str]
 ) -> NDArray[Any]:
     """Channels by name, (h, w, n)."""
-    spec = file.spec()
-    missing = [name for name in names if name not in spec.channelnames]
+    stored_names = spec.channelnames
+    missing = [name for name in names if name not in stored_names]
     if missing:
         raise _damaged(path, f"no channel {missing[0]}")
-    indices = [spec.channelnames.index(name) for name in names]
+    indices = [stored_names.index(name) for name in names]
     first, last = min(indices), max(indices) + 1
     check_size(
         path, spec.width, spec.height * (last - first), len(indices) * path.stat().st_size

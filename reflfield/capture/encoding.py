@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,8 @@ GAMMA_RANGE = (0.1, 10.0)
 LARGEST_TABLE_BYTES = 1 << 20
 # Pairs that a table may have: one for each code of 16 bits.
 MOST_PAIRS = 1 << 16
-REMEDY = "expected linear, srgb, gamma=NUMBER or a file of pairs"
+PAIR_SUFFIXES = (".csv", ".vset")
+REMEDY = "expected linear, srgb, gamma=NUMBER or a file of pairs (.csv)"
 
 
 def decode_srgb(encoded: ArrayLike) -> NDArray[np.floating[Any]]:
@@ -119,15 +121,15 @@ class Encoding:
         return PchipInterpolator(*np.array(points, np.float64).T)
 
 
-def parse_encoding(text: str, folder: Path | None = None) -> Encoding:
+def parse_encoding(text: str, find: Callable[[str], Path] = Path) -> Encoding:
     """The encoding that a description or an option names.
 
     Parameters
     ----------
     text : str
         ``linear``, ``srgb``, ``gamma=2.2`` or the name of a file of pairs (`read_pairs`).
-    folder : Path, optional
-        What a file's name is relative to; the working folder by default.
+    find : callable, optional
+        Gives the path of a file's name.
 
     Returns
     -------
@@ -147,10 +149,9 @@ def parse_encoding(text: str, folder: Path | None = None) -> Encoding:
         return Encoding(text)
     if text.startswith("gamma="):
         return _power(text)
-    path = (folder or Path()) / text
-    if not text or not path.suffix:
+    if Path(text).suffix.lower() not in PAIR_SUFFIXES:
         raise InputError(f"encoding: {REMEDY}, received {text!r}")
-    return read_pairs(path)
+    return read_pairs(find(text))
 
 
 def _power(text: str) -> Encoding:

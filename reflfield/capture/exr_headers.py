@@ -10,11 +10,12 @@ from typing import IO, NamedTuple
 from reflfield.errors import CaptureError
 
 LARGEST_HEADER = 1 << 22
+USUAL_HEADER = 1 << 13
 MOST_PARTS = 256
 MOST_CHANNELS = 1024
 LONGEST_NAME = 255
 
-MULTIPART, NON_IMAGE = 1 << 12, 1 << 11
+MULTIPART = 1 << 12
 
 
 class Window(NamedTuple):
@@ -92,7 +93,19 @@ def read_exr_parts(path: Path, file: IO[bytes]) -> tuple[ExrPart, ...]:
     """
     file.seek(4)
     (flags,) = struct.unpack("<I", file.read(4))
-    content, position = file.read(LARGEST_HEADER), 0
+    content = file.read(USUAL_HEADER)
+    try:
+        return _parts(path, content, flags)
+    except CaptureError:
+        rest = file.read(LARGEST_HEADER)
+        if not rest:
+            raise
+        return _parts(path, content + rest, flags)
+
+
+def _parts(path: Path, content: bytes, flags: int) -> tuple[ExrPart, ...]:
+    """Parts whose headers are in the content; one after the other, a zero byte at the end."""
+    position = 0
     parts: list[ExrPart] = []
     while True:
         attributes, position = _attributes(path, content, position)

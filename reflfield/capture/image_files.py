@@ -12,6 +12,7 @@ alpha 0 everything is black, whatever the file holds there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from reflfield.capture.clipping import measured_values
 from reflfield.capture.color_spaces import ColorSpace
 from reflfield.capture.decoding import StoredImage, decode_stored, raw_size
-from reflfield.capture.encoding import Encoding, encode_srgb
+from reflfield.capture.encoding import LINEAR, SRGB, Encoding, encode_srgb
 from reflfield.capture.image_headers import read_header
 from reflfield.capture.image_layers import choose_layer
 from reflfield.errors import CaptureError
@@ -134,7 +135,7 @@ def read_exposure(
         white = 1.0 if stored.integer else reading.white_level or 1.0
         values = encode_srgb(image / np.float32(white)).astype(np.float32)
         measured = measured & (values > 0) & (values < 1)
-        return values, measured, Encoding("srgb")
+        return values, measured, Encoding(SRGB)
     shape = image.shape
     return np.broadcast_to(stored.values, shape), np.broadcast_to(measured, shape), encoding
 
@@ -183,8 +184,14 @@ def read_coverage(path: Path | str) -> Float32:
     return np.clip(coverage, 0, 1)
 
 
-def image_size(path: Path | str, reading: ImageReading = AS_STATED) -> tuple[int, int]:
+def image_size(path: Path | str, reading: ImageReading | None = None) -> tuple[int, int]:
     """(width, height) from the header alone, nothing decoded.
+
+    Parameters
+    ----------
+    path : Path or str
+    reading : ImageReading, optional
+        Says which layer; by default it may be left open, and the first part or page counts.
 
     Raises
     ------
@@ -195,6 +202,8 @@ def image_size(path: Path | str, reading: ImageReading = AS_STATED) -> tuple[int
     header = read_header(path)
     if header.kind == "raw":
         return raw_size(path, header)
+    if reading is None:
+        return header.width, header.height
     layer = choose_layer(path, header, reading.layer)
     return layer.width, layer.height
 
@@ -243,13 +252,17 @@ def _decoded(stored: StoredImage, space: ColorSpace) -> Float32:
     top = stored.largest_code
     if top == 1 or stored.colour.size < top:
         return space.linear(_three_channels(stored.values))
-    table = space.encoding.decode(np.arange(top + 1, dtype=np.float32) / np.float32(top))
-    linear = _three_channels(table[stored.colour])
-    return (
-        linear
-        if space.matrix is None
-        else ColorSpace(Encoding("linear"), space.matrix).linear(linear)
-    )
+    linear = _three_channels(_table(space.encoding, top)[stored.colour])
+    if space.matrix is None:
+        return linear
+    return ColorSpace(Encoding(LINEAR), space.matrix).linear(linear)
+
+
+@lru_cache(maxsize=8)
+def _table(encoding: Encoding, largest_code: int) -> Float32:
+    """Linear values of all codes."""
+    codes = np.arange(largest_code + 1, dtype=np.float32)
+    return encoding.decode(codes / np.float32(largest_code))
 
 
 def _measured(stored: StoredImage, reading: ImageReading) -> Bool:

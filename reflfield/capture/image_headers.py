@@ -215,7 +215,7 @@ def _tiff(path: Path, file: IO[bytes]) -> ImageHeader:
     pages = read_tiff_pages(path, file)
     for page in pages:
         check_size(path, page.tile_width, page.tile_height, MAX_PIXELS)
-    first = pages[0]
+    first = next((page for page in pages if not page.reduced), pages[0])
     return ImageHeader(
         "tiff", first.width, first.height, first.orientation, first.alpha, pages=pages
     )

@@ -17,8 +17,6 @@ from reflfield.capture.exposures import merge_exposures
 from reflfield.capture.image_files import (
     AS_STATED,
     ImageReading,
-    image_orientation,
-    image_size,
     read_alpha,
     read_coverage,
     read_exposure,
@@ -213,7 +211,7 @@ class Capture:
         photograph = self.photographs[index]
         image = photograph.read()
         camera = self.cameras[photograph.camera]
-        _check_matches(photograph.path, camera, image.shape[1], image.shape[0])
+        check_matches(photograph.path, camera, image.shape[1], image.shape[0])
         return image
 
     def read_measured(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -243,7 +241,7 @@ class Capture:
         photograph = self.photographs[index]
         image, measured = photograph.read_measured()
         camera = self.cameras[photograph.camera]
-        _check_matches(photograph.path, camera, image.shape[1], image.shape[0])
+        check_matches(photograph.path, camera, image.shape[1], image.shape[0])
         return image, measured
 
     def read_silhouette(self, view: int) -> NDArray[np.float32]:
@@ -266,7 +264,7 @@ class Capture:
         if coverage is None:
             return _made_silhouette(self, view)
         what = path if path is not None else f"alpha of the photographs of {camera.id!r}"
-        _check_matches(what, camera, coverage.shape[1], coverage.shape[0])
+        check_matches(what, camera, coverage.shape[1], coverage.shape[0])
         if not (coverage > 0.5).any():
             raise CaptureError(
                 f"{what}: empty silhouette: no pixel of view {camera.id!r} is covered, the "
@@ -290,6 +288,31 @@ class Capture:
             for i in _sampled(self, view)
             if stores_alpha(self.photographs[i].path, self.photographs[i].exposures[0].reading)
         ]
+
+    def read_as(self, reading: ImageReading) -> Capture:
+        """The same capture, its photographs read in another way.
+
+        Parameters
+        ----------
+        reading : ImageReading
+            What it says holds for all photographs; what it leaves open stays as it is.
+        """
+        stated = {name: value for name, value in vars(reading).items() if value is not None}
+        if not stated:
+            return self
+        return replace(
+            self,
+            photographs=tuple(
+                replace(
+                    photograph,
+                    exposures=tuple(
+                        replace(e, reading=replace(e.reading, **stated))
+                        for e in photograph.exposures
+                    ),
+                )
+                for photograph in self.photographs
+            ),
+        )
 
     def subset(
         self, views: ArrayLike | None = None, lights: ArrayLike | None = None
@@ -389,49 +412,6 @@ def usual_base_geometry(n_views: int) -> str:
     return PLANE if n_views == 1 else HULL
 
 
-def check_photographs(capture: Capture) -> None:
-    """Demand that photographs and silhouettes exist and have their camera's size.
-
-    Only headers are read.
-
-    Raises
-    ------
-    CaptureError
-        Naming the first missing or mismatched file and how many there are.
-    """
-    missing = [e.path for p in capture.photographs for e in p.exposures if not e.path.is_file()]
-    if missing:
-        total = sum(len(p.exposures) for p in capture.photographs)
-        raise CaptureError(
-            f"{missing[0]}: photograph missing ({len(missing)} of {total} files are); "
-            "copy them or remove them from the description"
-        )
-    for photograph in capture.photographs:
-        camera = capture.cameras[photograph.camera]
-        for exposure in photograph.exposures:
-            size = image_size(exposure.path, exposure.reading)
-            _check_matches(exposure.path, camera, *size)
-    _check_orientations(capture)
-    for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
-        if path is not None:
-            _check_matches(path, camera, *image_size(path))
-
-
-def check_environments(capture: Capture) -> None:
-    """Demand that every environment map exists.
-
-    Raises
-    ------
-    CaptureError
-        Naming the light and the file.
-    """
-    for light in capture.lights:
-        if light.file is not None and not light.file.is_file():
-            raise CaptureError(
-                f"{light.file}: environment map of light {light.id!r} missing; copy it there"
-            )
-
-
 def _made_silhouette(capture: Capture, view: int) -> NDArray[np.float32]:
     return silhouette_from_photographs(
         (capture.read_photograph(i) for i in _sampled(capture, view)),
@@ -444,22 +424,6 @@ def _sampled(capture: Capture, view: int) -> list[int]:
     indices = [i for i, p in enumerate(capture.photographs) if p.camera == view]
     step = -(-len(indices) // SILHOUETTE_SAMPLE) or 1
     return indices[::step]
-
-
-def _check_orientations(capture: Capture) -> None:
-    """Demand that no camera has photographs that a viewer would turn differently."""
-    first: dict[int, tuple[int, Path]] = {}
-    for photograph in capture.photographs:
-        for exposure in photograph.exposures:
-            turn = image_orientation(exposure.path)
-            known, path = first.setdefault(photograph.camera, (turn, exposure.path))
-            if turn != known:
-                raise CaptureError(
-                    f"{exposure.path}: expected Exif orientation {known} as {path.name} of the "
-                    f"same camera {capture.cameras[photograph.camera].id!r} has, received "
-                    f"{turn}; pixels are read as stored, so turn the files alike and remove "
-                    "the entry"
-                )
 
 
 def _in_codes(value: float) -> str:
@@ -483,7 +447,14 @@ def _check_unique(what: str, ids: Sequence[str]) -> None:
         seen.add(id_)
 
 
-def _check_matches(path: Path | str, camera: Camera, width: int, height: int) -> None:
+def check_matches(path: Path | str, camera: Camera, width: int, height: int) -> None:
+    """Demand an image of the size that its camera has.
+
+    Raises
+    ------
+    CaptureError
+        Naming the file and both sizes.
+    """
     if (width, height) != (camera.width, camera.height):
         raise CaptureError(
             f"{path}: image size: expected {camera.width} x {camera.height} pixels as camera "

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
 from reflfield.capture.documents import LARGEST_COORDINATE, check_counts, read_json
+from reflfield.capture.image_files import ImageReading
 from reflfield.capture.lenses import NAMES as LENS_KEYS
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.names import has_controls, printable, quoted, unique_names
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.stated_readings import stated_reading
 from reflfield.errors import CaptureError
 
 FILE_NAME = "capture.json"
@@ -198,7 +200,8 @@ def _photographs(
         listed = _expanded(listed["pattern"], cameras, lights)
     view = {camera.id: i for i, camera in enumerate(cameras)}
     light = {light.id: i for i, light in enumerate(lights)}
-    exposures = [_exposures(entry, files) for entry in listed]
+    reading = stated_reading(document, files, str(files.description))
+    exposures = [_exposures(entry, files, reading) for entry in listed]
     names = unique_names([e[0].path for e in exposures], files.root)
     return tuple(
         Photograph(
@@ -225,9 +228,12 @@ def _expanded(
     ]
 
 
-def _exposures(entry: Mapping[str, Any], files: NamedFiles) -> tuple[Exposure, ...]:
+def _exposures(
+    entry: Mapping[str, Any], files: NamedFiles, of_all: ImageReading
+) -> tuple[Exposure, ...]:
     listed = entry.get("exposures") or [{"file": entry["file"], "seconds": 1.0}]
-    return tuple(Exposure(files.path(e["file"]), e["seconds"]) for e in listed)
+    reading = stated_reading(entry, files, f"{files.description}: photographs", of_all)
+    return tuple(Exposure(files.path(e["file"]), e["seconds"], reading) for e in listed)
 
 
 def _known(index: Mapping[str, int], id_: str, what: str, files: NamedFiles) -> int:

@@ -9,9 +9,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from reflfield.capture import lp, middlebury, native, transforms_json
-from reflfield.capture.consistency import check_lights_shine, check_pairs, unphotographed
+from reflfield.capture.consistency import (
+    check_environments,
+    check_lights_shine,
+    check_pairs,
+    check_photographs,
+    unphotographed,
+)
 from reflfield.capture.documents import parse_count, read_json, read_text
-from reflfield.capture.model import Capture, check_environments, check_photographs
+from reflfield.capture.image_files import AS_STATED, ImageReading
+from reflfield.capture.model import Capture
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
 from reflfield.files import check_regular
@@ -42,6 +49,7 @@ def open_capture(
     require_photographs: bool = True,
     follow_links: bool = False,
     test_split: bool = False,
+    reading: ImageReading = AS_STATED,
 ) -> Capture:
     """Open a capture, or frames to relight.
 
@@ -61,6 +69,8 @@ def open_capture(
         Whether to add the photographs that the capture's maker keeps for comparison, as
         ``transforms_test.json`` beside ``transforms_train.json`` does. They are marked
         (`Photograph.is_test`) and come after the others.
+    reading : ImageReading, optional
+        Encoding, layer and white level of all photographs, before what the description says.
 
     Returns
     -------
@@ -84,6 +94,7 @@ def open_capture(
     else:
         description, found = path, format or _kind_of_file(path)
     capture = _read(description, found, follow_links=follow_links, test_split=test_split)
+    capture = capture.read_as(reading)
     check_environments(capture)
     if require_photographs:
         check_pairs(capture)

@@ -100,6 +100,7 @@ def radiance_scale(header: ImageHeader) -> float:
     return 1.0 / exposure if exposure > 0 else math.nan
 
 
+@lru_cache(maxsize=16)
 def _primaries(curve: str, chromaticities: tuple[float, ...] | None) -> ColorSpace:
     matrix = rec709_from_primaries(chromaticities) if chromaticities else None
     return ColorSpace(Encoding(curve), matrix)

@@ -27,6 +27,12 @@ COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
 # NEF, ARW, PEF and others compress mosaics in ways of their own.
 RAW_COMPRESSIONS = (32767, 32769, 34713, 65000, 65535)
 
+# Of other tags only that they are there is kept.
+READ = {
+    *(SUBFILE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES, TILE_WIDTH, TILE_HEIGHT),
+    *(FORMAT, SUB_DIRECTORIES, PAGE_NAME, WHITE, PRIMARIES, ORIENTATION, EXTRA),
+}
+
 _TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "B", 8: "h", 9: "i", 10: "ii"}
 _TYPES |= {11: "f", 12: "d", 13: "I", 16: "Q", 17: "q", 18: "Q"}
 _PLACE = {
@@ -192,7 +198,7 @@ def _directory(
     following = struct.unpack(order + next_type, tail)[0] if tail else 0
     tags: Tags = {}
     for tag, kind, length, value in struct.iter_unpack(order + entry_type, entries):
-        known = kind in _TYPES and length <= MOST_VALUES
+        known = tag in READ and kind in _TYPES and length <= MOST_VALUES
         tags[tag] = _values(file, order, _TYPES[kind], length, value, big) if known else ()
     return tags, following
 

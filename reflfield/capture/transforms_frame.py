@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.documents import number
 from reflfield.capture.names import quoted
+from reflfield.capture.stated_readings import READING_KEYS
 from reflfield.errors import CaptureError
 
 LENS_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -24,7 +25,7 @@ _READ = {
     "file_path", "file_ext", "transform_matrix", "mask_path", "up", "frames", *SPLIT_KEYS,
     "camera_model", "is_fisheye", "w", "h", "fl_x", "fl_y", "cx", "cy", *LENS_KEYS,
     "camera_angle_x", "camera_angle_y", "camera_intrinsics",
-    "pl_pos", "pl_intensity", "environment", "environment_convention",
+    "pl_pos", "pl_intensity", "environment", "environment_convention", *READING_KEYS,
 }  # fmt: skip
 # Of the scene's bounds, depth maps and other programs' records: they say nothing of cameras,
 # lights or values.

@@ -21,11 +21,13 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.documents import check_counts, number_array, read_json
+from reflfield.capture.image_files import ImageReading
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.names import IMAGE_SUFFIXES, printable, quoted, unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.stated_readings import READING_KEYS, stated_reading
 from reflfield.capture.transforms_camera import frame_camera
 from reflfield.capture.transforms_frame import SPLIT_KEYS, Frame, check_keys, leading_digits
 from reflfield.capture.transforms_light import check_lights, frame_light
@@ -63,6 +65,7 @@ class _Reading:
     silhouettes: dict[int, Path] = field(default_factory=dict)
     photographs: list[Photograph] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    readings: dict[str, ImageReading] = field(default_factory=dict)
 
     def add(self, frame: Frame, is_test: bool) -> None:
         """Read one frame."""
@@ -72,7 +75,16 @@ class _Reading:
         light = self.lights.add(*frame_light(frame, self.files))
         if frame.get("mask_path"):
             self.silhouettes.setdefault(view, self.files.path(frame.get("mask_path")))
-        self.photographs.append(Photograph("", view, light, (Exposure(path),), is_test=is_test))
+        exposure = Exposure(path, reading=self._image_reading(frame))
+        self.photographs.append(Photograph("", view, light, (exposure,), is_test=is_test))
+
+    def _image_reading(self, frame: Frame) -> ImageReading:
+        """How the frame's file is read; frames that say the same share one reading."""
+        values = {key: frame.get(key) for key in READING_KEYS}
+        key = repr(values)
+        if key not in self.readings:
+            self.readings[key] = stated_reading(values, self.files, frame.what)
+        return self.readings[key]
 
 
 def read_transforms(
