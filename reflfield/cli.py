@@ -319,10 +319,10 @@ def relight_to(
 ) -> list[Path]:
     """Relight frames; their EXR files."""
     from reflfield.capture.readers import open_capture
-    from reflfield.relighting.frames import relight_frames
+    from reflfield.steps.standalone import write_relit_frames
 
     opened = open_capture(frames, require_photographs=False, **reading)
-    return [frame.exr for frame in relight_frames(field, opened, out, options)]
+    return write_relit_frames(field, opened, out, options)
 
 
 def turntable_lights(
@@ -368,12 +368,14 @@ def orbit_to(
     field: Any, lights: Any, out: Path, options: Any, chosen: dict[str, Any]
 ) -> list[Path]:
     """Render a turntable; animation and contact sheet."""
+    from reflfield.files import filling
     from reflfield.relighting.orbit import OrbitOptions, render_orbit
 
     stated = {name: value for name, value in chosen.items() if value is not None}
     orbit = OrbitOptions(up=tuple(field.up.tolist()), **stated)
-    made = render_orbit(field, lights, out, orbit, options)
-    return [made.animation, made.contact_sheet]
+    with filling(out) as partial:
+        made = render_orbit(field, lights, partial, orbit, options)
+    return [out / path.relative_to(partial) for path in (made.animation, made.contact_sheet)]
 
 
 @app.command()
@@ -479,6 +481,7 @@ def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     from reflfield.steps.choices import words_of
     from reflfield.steps.holding_out import held_out_words, left_out_words
+    from reflfield.steps.outputs import problems_of
     from reflfield.steps.publishing import published
     from reflfield.steps.quantising import missed_quality
 
@@ -486,7 +489,11 @@ def say_results(job: Any, started: float) -> None:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
         say(f"{record.name:<18}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
     say(f"held out: {held_out_words(job.split)}")
-    for words in (*left_out_words(job.capture, job.split), *words_of(job)):
+    for words in (
+        *left_out_words(job.capture, job.split),
+        *words_of(job),
+        *problems_of(job),
+    ):
         say(words)
     if job.stages.record("comparison") is not None:
         say_metrics(json.loads((job.out / "metrics.json").read_text()))

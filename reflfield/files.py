@@ -9,7 +9,9 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 import stat
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -227,6 +229,30 @@ def naming(path: Path | str) -> Iterator[None]:
         error.strerror = error.strerror or str(error) or type(error).__name__
         error.filename = str(path)
         raise
+
+
+@contextmanager
+def filling(folder: Path) -> Iterator[Path]:
+    """Yield a new folder whose files go to `folder` if the block succeeds, else vanish.
+
+    After an error `folder` is as it was: absent, or with what it held.
+    """
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=folder))
+    try:
+        yield partial
+        for file in sorted(path for path in partial.rglob("*") if path.is_file()):
+            target = folder / file.relative_to(partial)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            flush_to_disk(file)
+            file.replace(target)
+        made = []
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        for path in made:
+            if not any(path.iterdir()):
+                path.rmdir()
 
 
 def flush_to_disk(path: Path) -> None:

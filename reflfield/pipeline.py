@@ -33,6 +33,7 @@ from reflfield.steps import (
     reflectance,
     surface,
 )
+from reflfield.steps.holding_out import held_out_counts
 from reflfield.steps.job import Job
 from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
@@ -182,11 +183,18 @@ ORDER = (
         reads=lambda job: {"photographs": job.digest_of(job.training, "photographs")},
         intact=reflectance.lost_observations,
     ),
+    # silhouettes of the frames that fields are compared on, all photographs considered
+    Stage(
+        evaluation.SILHOUETTES,
+        evaluation.write_silhouettes_of_frames,
+        after=("hull",),
+        reads=evaluation.silhouettes_digests,
+    ),
     # what is open is settled by trials on the held-out frames
     Stage(
         choices.STAGE,
         try_candidates,
-        after=("observations",),
+        after=("observations", evaluation.SILHOUETTES),
         options=lambda options: (
             options.indirect,
             options.completion,
@@ -255,15 +263,18 @@ ORDER = (
     Stage(
         "comparison",
         evaluation.write_comparison,
-        after=("compression", "without_alignment"),
+        after=("compression", "without_alignment", evaluation.SILHOUETTES),
         options=relit_with,
-        reads=frames_digests,
+        reads=lambda job: {
+            **frames_digests(job),
+            "held_out": json.dumps(held_out_counts(job.split)),
+        },
     ),
     # what bits bring: the models quantised more and more coarsely
     Stage(
         "rate_distortion",
         rate_distortion.write_rate_distortion,
-        after=("compression", "without_alignment"),
+        after=("compression", "without_alignment", evaluation.SILHOUETTES),
         options=relit_with,
         reads=frames_digests,
         wanted=lambda job: job.options.shows_rate_distortion,

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from reflfield.capture.image_files import read_image
 from reflfield.capture.model import Capture
+from reflfield.comparison.coverage import FrameSilhouettes
 from reflfield.comparison.metrics import Comparison, FramePair, compare_frames
+from reflfield.errors import NumericalError
 from reflfield.field.model import ReflectanceField
-from reflfield.progress import track
 from reflfield.relighting.frames import relight_frames
 from reflfield.relighting.renderer import RenderOptions
 
@@ -24,64 +25,78 @@ class RelitPairs:
     Parameters
     ----------
     frames : Capture
-        Photographs and silhouettes.
+        Photographs.
     folder : Path
         Holds NAME.exr of every frame.
+    silhouettes : FrameSilhouettes
+        Of the views of the frames.
     """
 
     frames: Capture
     folder: Path
+    silhouettes: FrameSilhouettes
 
     def __len__(self) -> int:
         return len(self.frames.photographs)
 
     def __iter__(self) -> Iterator[FramePair]:
         for i, photograph in enumerate(self.frames.photographs):
+            radiance, measured = self.frames.read_measured(i)
             yield FramePair(
                 name=photograph.name,
-                photograph=self.frames.read_photograph(i),
+                photograph=radiance,
                 relit=read_image(self.folder / f"{photograph.name}.exr"),
-                silhouette=self.frames.read_silhouette(photograph.camera),
+                silhouette=self.silhouettes.read(photograph.camera),
+                # What is too dark to measure is as good as black; what is too bright is not.
+                excluded=np.any(~measured & (radiance > 0), axis=-1, keepdims=True)[..., 0],
+                silhouette_from=self.silhouettes.origins[photograph.camera],
             )
+
+    def measured_in(self, comparison: Comparison) -> RelitPairs:
+        """Those frames alone that a comparison of them has measured."""
+        names = {frame.name for frame in comparison.frames}
+        kept = tuple(p for p in self.frames.photographs if p.name in names)
+        return replace(self, frames=replace(self.frames, photographs=kept))
 
 
 def compare_with_photographs(
     field: ReflectanceField,
     frames: Capture,
+    silhouettes: FrameSilhouettes,
     folder: Path,
     options: RenderOptions | None = None,
-) -> tuple[Comparison, RelitPairs]:
+) -> Comparison:
     """Relight frames into a folder and measure them against their photographs.
 
     Parameters
     ----------
     field : ReflectanceField
     frames : Capture
-        Cameras, lights, photographs, silhouettes.
+        Cameras, lights, photographs.
+    silhouettes : FrameSilhouettes
+        Of the views of the frames.
     folder : Path
         Gets NAME.exr and NAME.png of every frame.
     options : RenderOptions, optional
 
     Returns
     -------
-    comparison : Comparison
-    pairs : RelitPairs
-        For the report.
+    Comparison
 
     Raises
     ------
     InputError
-        If there is no frame or a frame cannot be compared.
+        If there is no frame, or none that can be measured.
+    NumericalError
+        If what the field shows is not finite.
     """
-    for _ in relight_frames(field, frames, folder, options):
-        pass
-    pairs = RelitPairs(frames, folder)
-    return compare_frames(track_pairs(pairs)), pairs
-
-
-def track_pairs(pairs: RelitPairs) -> list[FramePair]:
-    """All pairs, with progress."""
-    return list(track(pairs, len(pairs), "reading frames"))
+    for frame in relight_frames(field, frames, folder, options):
+        if not np.isfinite(frame.rendering.image).all():
+            raise NumericalError(
+                f"frame {frame.name!r}: expected finite radiance of the field, received "
+                "NaN or infinity: its values are too large; make the field again"
+            )
+    return compare_frames(RelitPairs(frames, folder, silhouettes))
 
 
 def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:

@@ -40,6 +40,10 @@ PSNR_CAP_DB = 100.0
 # skimage's default window; smaller only for pictures that it does not fit into.
 SSIM_WINDOW_PX = 7
 
+# What is said of a frame, in the order of ``metrics.json``.
+FRAME_KEYS = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels", "n_excluded",
+              "silhouette_from")  # fmt: skip
+
 DEFINITIONS: Mapping[str, str] = {
     "object_pixels": "silhouette coverage >= 0.5, eroded by a disk of radius 2 pixels",
     "exposure": "1 / 99.5th percentile of the photographs' luminance over all object pixels",
@@ -48,8 +52,13 @@ DEFINITIONS: Mapping[str, str] = {
     "ssim": "scikit-image, uniform 7 x 7 window, on the LDR pictures, map averaged",
     "flip": "LDR-FLIP, map averaged; 0 is equal, 1 is the worst",
     "backdrop": "black in both pictures where coverage < 0.5, so windows do not see it",
+    "excluded": "pixels where the photograph is saturated; equal in both pictures, not counted",
     "colour_ratio": "sum of relit / sum of photograph over object pixels, per channel",
 }
+
+
+class NothingToMeasure(InputError):
+    """No frame shows a pixel of the object that could be measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +73,24 @@ class FramePair:
         Linear radiance.
     silhouette : (h, w) float
         Coverage by the object, 0 to 1.
+    excluded : (h, w) bool, optional
+        True where the photograph is no measurement, such as saturated pixels.
+    silhouette_from : str
+        Where the silhouette comes from.
     """
 
     name: str
     photograph: NDArray[Any]
     relit: NDArray[Any]
     silhouette: NDArray[Any]
+    excluded: NDArray[np.bool_] | None = None
+    silhouette_from: str = "given"
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """(h, w) True where the pixel is measured: on the object, and a measurement."""
+        inside = object_pixels(self.silhouette)
+        return inside if self.excluded is None else inside & ~self.excluded
 
 
 @dataclass(frozen=True)
@@ -85,6 +106,10 @@ class FrameMetrics:
         Object pixels measured.
     colour_ratio : tuple of three float or None
         Relit over photograph per channel; None where the photograph is black.
+    n_excluded : int
+        Object pixels left out because the photograph is saturated there.
+    silhouette_from : str
+        Where the silhouette comes from.
     """
 
     name: str
@@ -94,6 +119,12 @@ class FrameMetrics:
     flip: float
     n_pixels: int
     colour_ratio: tuple[float | None, float | None, float | None]
+    n_excluded: int = 0
+    silhouette_from: str = "given"
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``metrics.json`` says of the frame; see `Comparison.from_dict`."""
+        return {key: getattr(self, key) for key in FRAME_KEYS}
 
 
 @dataclass(frozen=True)
@@ -107,11 +138,14 @@ class Comparison:
         The factor e that all pictures were multiplied with.
     warnings : tuple of str
         What a reader of the numbers should know.
+    not_measured : tuple of str
+        Frames that show no pixel of the object that could be measured.
     """
 
     frames: tuple[FrameMetrics, ...]
     exposure: float
     warnings: tuple[str, ...] = ()
+    not_measured: tuple[str, ...] = ()
 
     @property
     def mean(self) -> dict[str, float]:
@@ -128,10 +162,10 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``metrics.json``; see `to_json`."""
-        keys = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels")
         return {
-            "frames": [{key: getattr(f, key) for key in keys} for f in self.frames],
+            "frames": [frame.to_dict() for frame in self.frames],
             "mean": self.mean,
+            "measured": self.measured,
             "extra": {
                 "exposure": self.exposure,
                 "pixels_per_degree": PIXELS_PER_DEGREE,
@@ -145,15 +179,44 @@ class Comparison:
             },
         }
 
+    @property
+    def measured(self) -> dict[str, Any]:
+        """On what the measures were taken: counts over all frames."""
+        origins = [frame.silhouette_from for frame in self.frames]
+        return {
+            "frames": len(self.frames),
+            "pixels": sum(frame.n_pixels for frame in self.frames),
+            "saturated_pixels_left_out": sum(frame.n_excluded for frame in self.frames),
+            "silhouettes": {origin: origins.count(origin) for origin in sorted(set(origins))},
+            "frames_not_measured": list(self.not_measured),
+        }
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Comparison:
+        """The comparison that `to_dict` has told the content of."""
+        extra = content["extra"]
+        ratios = {more["name"]: tuple(more["colour_ratio"]) for more in extra["frames"]}
+        frames = tuple(
+            FrameMetrics(**frame, colour_ratio=ratios[frame["name"]])
+            for frame in content["frames"]
+        )
+        return Comparison(
+            frames,
+            extra["exposure"],
+            tuple(extra["warnings"]),
+            tuple(content["measured"]["frames_not_measured"]),
+        )
+
     def to_json(self) -> str:
         """``metrics.json``: frames, mean, and under "extra" what else was found."""
         return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
 
 
-def metrics_text(compared: Mapping[str, Any] | None) -> str:
-    """Text of ``metrics.json``: every frame and the mean, nothing beside them."""
-    kept = {"frames": [], "mean": {}} if compared is None else compared
-    return json.dumps({name: kept[name] for name in ("frames", "mean")}, indent=2) + "\n"
+def metrics_text(compared: Mapping[str, Any] | None, **more: Any) -> str:
+    """Text of ``metrics.json``: every frame, the mean, on what they were measured, and more."""
+    nothing: dict[str, Any] = {"frames": [], "mean": {}, "measured": {}}
+    kept = nothing if compared is None else {name: compared[name] for name in nothing}
+    return json.dumps({**kept, **more}, indent=2, allow_nan=False) + "\n"
 
 
 def object_pixels(silhouette: ArrayLike) -> NDArray[np.bool_]:
@@ -188,7 +251,8 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     Parameters
     ----------
     pictures : iterable of ((h, w, 3), (h, w))
-        Photograph (linear) and silhouette of every frame.
+        Photograph (linear) and silhouette of every frame; or, instead of the silhouette,
+        True for the pixels that count.
 
     Returns
     -------
@@ -212,17 +276,22 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     4.0
     """
     kept = [
-        luminance(np.asarray(photograph)[object_pixels(silhouette)])
+        luminance(np.asarray(photograph)[_counted(silhouette)])
         for photograph, silhouette in pictures
     ]
     values = np.concatenate(kept) if kept else np.zeros(0)
     if values.size == 0:
-        raise InputError(
+        raise NothingToMeasure(
             "frames: expected at least one object pixel to set the exposure from, received "
             f"none in {len(kept)} frames; check the silhouettes"
         )
     white = float(np.percentile(values, EXPOSURE_PERCENTILE))
     return 1.0 / white if white > 0.0 else math.nan
+
+
+def _counted(silhouette: ArrayLike) -> NDArray[np.bool_]:
+    pixels: NDArray[Any] = np.asarray(silhouette)
+    return pixels if pixels.dtype == np.bool_ else object_pixels(pixels)
 
 
 def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -> Comparison:
@@ -241,11 +310,13 @@ def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -
     -------
     Comparison
 
+        Frames without a pixel that counts are left out and named.
+
     Raises
     ------
     InputError
-        If there is no frame, or a frame has no object pixel, or a value under
-        one is not finite. The message names the frame.
+        If there is no frame, or none with a pixel that counts, or a value under one is
+        not finite. The message names the frame.
     ShapeError
         If photograph, relit picture and silhouette differ in size.
 
@@ -260,15 +331,23 @@ def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -
     """
     pairs = list(frames) if isinstance(frames, Iterator) else frames
     if exposure is None:
-        exposure = common_exposure((p.photograph, p.silhouette) for p in _checked(pairs))
+        exposure = common_exposure((p.photograph, p.counted) for p in _checked(pairs))
     notes: tuple[str, ...] = ()
     if math.isnan(exposure):
         exposure = 1.0
         notes = ("The photographs are black over the object; exposure 1 was used.",)
-    measured = tuple(measure_frame(pair, exposure) for pair in pairs)
+    measured, left_out = [], []
+    for pair in pairs:
+        if pair.counted.any():
+            measured.append(measure_frame(pair, exposure))
+        else:
+            left_out.append(pair.name)
     if not measured:
-        raise InputError("frames: expected at least one frame to compare, received none")
-    return Comparison(measured, exposure, notes)
+        raise NothingToMeasure(
+            "frames: expected at least one frame with object pixels to compare, received none"
+            + (f" ({', '.join(left_out)} have none); check the silhouettes" if left_out else "")
+        )
+    return Comparison(tuple(measured), exposure, notes, tuple(left_out))
 
 
 def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
@@ -292,7 +371,12 @@ def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
         If the pictures differ in size.
     """
     check_pair(pair)
-    counted = object_pixels(pair.silhouette)
+    counted = pair.counted
+    if not counted.any():
+        raise InputError(
+            f"frame {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, eroded "
+            "by 2 pixels), received none; leave the frame out or check its silhouette"
+        )
     photograph, relit = without_backdrop(pair)
     shown_photograph, shown_relit = display(photograph, exposure), display(relit, exposure)
     return FrameMetrics(
@@ -303,19 +387,21 @@ def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
         flip=float(flip_map(shown_photograph, shown_relit)[counted].mean(dtype=np.float64)),
         n_pixels=int(counted.sum()),
         colour_ratio=_colour_ratio(photograph[counted], relit[counted]),
+        n_excluded=int((object_pixels(pair.silhouette) & ~counted).sum()),
+        silhouette_from=pair.silhouette_from,
     )
 
 
 def check_pair(pair: FramePair) -> None:
-    """Demand equal sizes, at least one object pixel and finite values.
+    """Demand equal sizes and finite values.
 
     Raises
     ------
     ShapeError
         If photograph, relit picture and silhouette differ in size.
     InputError
-        If there is no object pixel, or a value where coverage >= 0.5 is not
-        finite. Values elsewhere are never read and may be anything.
+        If a value where coverage >= 0.5 is not finite. Values elsewhere are never
+        read and may be anything.
     """
     size = np.shape(pair.silhouette)
     for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
@@ -324,11 +410,6 @@ def check_pair(pair: FramePair) -> None:
                 f"frame {pair.name!r}, {what}: expected shape (h, w, 3) with the size of the "
                 f"silhouette, received {np.shape(image)} and silhouette {size}"
             )
-    if not object_pixels(pair.silhouette).any():
-        raise InputError(
-            f"frame {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, eroded "
-            "by 2 pixels), received none; leave the frame out or check its silhouette"
-        )
     covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
     for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
         _check_finite(pair.name, what, image, covered)
@@ -338,13 +419,16 @@ def without_backdrop(pair: FramePair) -> tuple[Image, Image]:
     """Photograph and relit picture as float64, black where coverage < 0.5.
 
     SSIM and FLIP look at neighbourhoods; a backdrop that the field cannot know
-    must not enter them from outside the silhouette.
+    must not enter them from outside the silhouette. Nor must a saturated highlight: where
+    pixels are excluded, the relit picture is equal to the photograph.
     """
     covered = (np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT)[..., None]
     photograph, relit = (
         np.where(covered, np.asarray(image, dtype=np.float64), 0.0)
         for image in (pair.photograph, pair.relit)
     )
+    if pair.excluded is not None:
+        relit = np.where(pair.excluded[..., None], photograph, relit)
     return photograph, relit
 
 

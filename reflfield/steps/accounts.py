@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -136,15 +135,15 @@ def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
 
 def _frames(job: Job) -> Account:
     """Frames that are compared, from the metrics that were written."""
-    sets = evaluation.frame_sets(job)
-    measured = {
-        name: len(json.loads((evaluation.metrics_path(job, name)).read_text())["frames"])
-        for name in sets
-    }
-    names = {"heldout": "held out, measured", "truth": "unseen and simulated, measured"}
-    return Account(
-        "comparison",
-        "frames",
-        sum(len(frames.photographs) for frames in sets.values()),
-        {names[name]: count for name, count in measured.items()},
-    )
+    names = {"heldout": "held out", "truth": "unseen and simulated"}
+    sets, parts = evaluation.frame_sets(job), {}
+    for name, frames in sets.items():
+        comparison = evaluation.comparison_of(job, name)
+        if comparison is None:
+            parts[f"{names[name]}, not compared"] = len(frames.photographs)
+            continue
+        parts[f"{names[name]}, measured"] = len(comparison.frames)
+        if comparison.not_measured:
+            parts[f"{names[name]}, without an object pixel"] = len(comparison.not_measured)
+    total = sum(len(frames.photographs) for frames in sets.values())
+    return Account("comparison", "frames", total, parts)

@@ -195,8 +195,11 @@ def conclude(folder: Path, tried: Sequence[tuple[Candidate, Job]]) -> dict[str, 
 
     Times of the trials go to the counts, as times do.
     """
-    psnr = {candidate.name: _heldout_psnr(folder / candidate.name) for candidate, _ in tried}
-    taken = clearly_best(psnr)
+    measured = {
+        candidate.name: _heldout_psnr(folder / candidate.name) for candidate, _ in tried
+    }
+    psnr = {name: values for name, values in measured.items() if values}
+    taken = clearly_best(psnr or measured)
     text = {"taken": taken, "tried": [asdict(candidate) for candidate, _ in tried]}
     (folder / OUTCOME).write_text(json.dumps(text, indent=1))
     return {
@@ -211,6 +214,8 @@ def conclude(folder: Path, tried: Sequence[tuple[Candidate, Job]]) -> dict[str, 
 
 
 def _heldout_psnr(folder: Path) -> list[float]:
+    if not (folder / "heldout.json").is_file():  # no frame shows a pixel of the object
+        return []
     metrics = json.loads((folder / "heldout.json").read_text())
     return [frame["psnr_ldr"] for frame in metrics["frames"]]
 
@@ -242,6 +247,8 @@ def clearly_best(psnr: Mapping[str, Sequence[float]]) -> str:
     taken = names[0]
     for name in names[1:]:
         gains = np.subtract(psnr[name], psnr[taken])
+        if not len(gains):
+            return taken
         scatter = max(CHANCE_DB, gains.std(ddof=1) if len(gains) > 1 else 0.0)
         if gains.mean() > scatter / np.sqrt(len(gains)):
             taken = name
@@ -296,6 +303,8 @@ def words_of(job: Job) -> Iterator[str]:
 def _compared(job: Job) -> str:
     record = job.stages.record(STAGE)
     psnr = record.counts["heldout PSNR, dB"] if record is not None else {}
+    if not psnr:
+        return "no held-out frame shows a pixel of the object that could be measured"
     found = ", ".join(f"{name} {value:.2f} dB" for name, value in psnr.items())
     n_frames = len(job.held_frames.photographs)
     taken = outcome(job).taken.name

@@ -13,8 +13,13 @@ from scipy.spatial import cKDTree
 
 from reflfield.capture.model import Capture
 from reflfield.capture.readers import open_capture
+from reflfield.comparison.coverage import (
+    FrameSilhouettes,
+    open_frame_silhouettes,
+    write_frame_silhouettes,
+)
 from reflfield.comparison.heldout import RelitPairs, compare_with_photographs
-from reflfield.comparison.metrics import Comparison, compare_frames, metrics_text
+from reflfield.comparison.metrics import Comparison, NothingToMeasure, metrics_text
 from reflfield.comparison.truth import (
     CompletionError,
     FrameErrors,
@@ -27,6 +32,7 @@ from reflfield.comparison.truth import (
     surface_points,
 )
 from reflfield.config import Resources
+from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.field.model import ReflectanceField
 from reflfield.observations.resampling import (
@@ -38,36 +44,69 @@ from reflfield.observations.resampling import (
 )
 from reflfield.relighting.renderer import RenderOptions
 from reflfield.sphere.hemisphere import softened_cosine
+from reflfield.steps.holding_out import held_out_counts
 from reflfield.steps.job import Job
 
 # Texels farther from a true surface point than this many texel spacings see another part.
 MATCH_SPACINGS = 2.0
 # Folders of the comparison: of the field itself, and of the one that it is compared with.
 MAIN, WITHOUT = "field", "without_alignment"
+# Stage of the frames' silhouettes, and what a record says of what was left out.
+SILHOUETTES, PROBLEMS = "frame_silhouettes", "problems"
+
+
+def write_silhouettes_of_frames(job: Job, folder: Path) -> dict[str, Any]:
+    """Silhouettes of all views that are compared, once for all fields."""
+    origins: list[str] = []
+    for name, frames in frame_sets(job).items():
+        made = write_frame_silhouettes(
+            frames, around(job, name), job.hull_mesh, folder / name, job.resources.workers
+        )
+        origins += made.origins
+    return {"views": len(origins), **{o: origins.count(o) for o in sorted(set(origins))}}
 
 
 def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
     """Relight held-out frames and measure them; without any, say so."""
     counts: dict[str, Any] = {}
+    problems = [problem for _, problem in [truth_frames(job)] if problem]
     for variant, stage in variants(job).items():
         field = open_field(job.stages.root / stage / "field.rfld")
-        counts |= _compare(job, field, folder / variant, variant)
+        measured, failed = _compare(job, field, folder / variant, variant)
+        counts |= measured
+        problems += failed if variant == MAIN else []
     compared = [folder / MAIN / f"{name}.json" for name in ("heldout", "truth")]
     main = next((json.loads(path.read_text()) for path in compared if path.is_file()), None)
-    (folder / "metrics.json").write_text(metrics_text(main))
-    return {"frames": sum(len(f.photographs) for f in frame_sets(job).values()), **counts}
+    (folder / "metrics.json").write_text(
+        metrics_text(main, held_out=held_out_counts(job.split))
+    )
+    n_frames = sum(len(f.photographs) for f in frame_sets(job).values())
+    return {"frames": n_frames, **counts, PROBLEMS: problems}
 
 
-def _compare(job: Job, field: ReflectanceField, folder: Path, variant: str) -> dict[str, float]:
+def _compare(
+    job: Job, field: ReflectanceField, folder: Path, variant: str
+) -> tuple[dict[str, float], list[str]]:
+    """Compare one field on all sets of frames; counts, and why a set was not compared."""
     folder.mkdir(exist_ok=True)
     options = within_memory(job.options.relighting, job.resources)
-    counts = {}
+    counts, problems = {}, []
     for name, frames in frame_sets(job).items():
-        comparison, _ = compare_with_photographs(field, frames, folder / name, options)
+        silhouettes = silhouettes_of_frames(job, name, frames)
+        try:
+            comparison = compare_with_photographs(
+                field, frames, silhouettes, folder / name, options
+            )
+        except InputError as error:
+            # Without the truth, or where nothing can be measured, the run goes on.
+            if name == "heldout" and not isinstance(error, NothingToMeasure):
+                raise
+            problems.append(f"{name}: not compared: {error}")
+            continue
         (folder / f"{name}.json").write_text(comparison.to_json())
         words = f"{name} PSNR, dB" if variant == MAIN else f"{name} PSNR {variant}, dB"
         counts[words.replace("_", " ")] = comparison.mean["psnr_ldr"]
-    return counts
+    return counts, problems
 
 
 def variants(job: Job) -> dict[str, str]:
@@ -95,22 +134,64 @@ def frame_sets(job: Job) -> dict[str, Capture]:
     sets: dict[str, Capture] = {}
     if job.held_frames.photographs:
         sets["heldout"] = job.held_frames
-    truth = open_truth(job.capture.root)
-    frames = truth.heldout() if truth else None
+    frames, _ = truth_frames(job)
     if frames is not None:
-        sets["truth"] = open_capture(frames)
+        sets["truth"] = frames
     return sets
 
 
+def truth_frames(job: Job) -> tuple[Capture | None, str]:
+    """Unseen frames of a simulated capture; if they cannot be used, why not."""
+    try:
+        truth = open_truth(job.capture.root)
+        path = truth.heldout() if truth else None
+        return (None if path is None else open_capture(path)), ""
+    except InputError as error:
+        return None, f"truth: not compared: {error}"
+
+
+def around(job: Job, name: str) -> Capture:
+    """What a set of frames is part of: all photographs of their cameras."""
+    return job.capture if name == "heldout" else frame_sets(job)[name]
+
+
+def silhouettes_digests(job: Job) -> dict[str, str]:
+    """Digests of what the silhouettes of the frames are made from."""
+    digests = {}
+    for name, frames in frame_sets(job).items():
+        whole = around(job, name)
+        ids = {camera.id for camera in frames.cameras}
+        views = [i for i, camera in enumerate(whole.cameras) if camera.id in ids]
+        digests[name] = job.digest_of(whole.subset(views), "cameras", "silhouettes")
+    return digests
+
+
+def silhouettes_of_frames(job: Job, name: str, frames: Capture) -> FrameSilhouettes:
+    """Silhouettes of a set of frames, as their stage has made them."""
+    return open_frame_silhouettes(job.stages.root / SILHOUETTES / name, frames)
+
+
 def relit_pairs(job: Job, variant: str = MAIN) -> dict[str, RelitPairs]:
-    """What the comparison stage has relit."""
+    """What the comparison stage has relit and measured."""
     root = job.stages.root / "comparison" / variant
-    return {name: RelitPairs(frames, root / name) for name, frames in frame_sets(job).items()}
+    pairs = {}
+    for name, frames in frame_sets(job).items():
+        comparison = comparison_of(job, name, variant)
+        if comparison is not None:
+            silhouettes = silhouettes_of_frames(job, name, frames)
+            relit = RelitPairs(frames, root / name, silhouettes)
+            pairs[name] = relit.measured_in(comparison)
+    return pairs
 
 
-def metrics_path(job: Job, name: str) -> Path:
-    """File of the metrics of one set of frames, relit from the field."""
-    return job.stages.root / "comparison" / MAIN / f"{name}.json"
+def comparison_of(job: Job, name: str, variant: str = MAIN) -> Comparison | None:
+    """Metrics of one set of frames that the comparison stage has measured."""
+    return read_comparison(job.stages.root / "comparison" / variant / f"{name}.json")
+
+
+def read_comparison(path: Path) -> Comparison | None:
+    """Metrics as the comparison stage writes them; None where it has not."""
+    return Comparison.from_dict(json.loads(path.read_text())) if path.is_file() else None
 
 
 # --- truth of simulated captures ----------------------------------------------------------
@@ -217,9 +298,3 @@ def completed_samples(
     values = np.maximum(unroot(apply_both(at_views, at_lights, nodes), domain), 0)
     cosine = softened_cosine(local[1][..., 2]) if sides[1] > 1 else np.ones(lights.shape[:2])
     return (values * cosine[:, None, :, None]).astype(np.float32)
-
-
-def comparison_of(job: Job, name: str, variant: str = MAIN) -> Comparison | None:
-    """Metrics of one set, measured again from the stored pictures."""
-    pairs = relit_pairs(job, variant).get(name)
-    return compare_frames(pairs) if pairs is not None and len(pairs) else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -251,6 +252,16 @@ def held_out_words(split: Split) -> str:
     if len(split.aside):
         parts.append(f"{len(split.aside)} others of those are used for neither")
     return "; ".join([*parts, f"{n} of {total} make the field"])
+
+
+def held_out_counts(split: Split) -> dict[str, Any]:
+    """How many photographs were used for what, for ``metrics.json``."""
+    return {
+        "kind": split.kind or "nothing",
+        "photographs_compared": len(split.compared),
+        "photographs_used_for_neither": len(split.aside),
+        "photographs_of_the_field": len(split.trained),
+    }
 
 
 def _which(split: Split) -> str:

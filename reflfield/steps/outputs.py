@@ -15,7 +15,7 @@ from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_writing import write_exr
 from reflfield.comparison import sections
 from reflfield.comparison.heldout import RelitPairs, mean_sample
-from reflfield.comparison.metrics import Comparison, compare_frames
+from reflfield.comparison.metrics import Comparison
 from reflfield.comparison.pictures import texture
 from reflfield.comparison.report import ReportContent, Section, write_report
 from reflfield.comparison.truth import open_truth
@@ -172,10 +172,17 @@ def raw_bytes(job: Job) -> int:
     return int(np.prod(job.observed.views.shape)) * job.training.n_lights * 3 * 2
 
 
+def problems_of(job: Job) -> Iterator[str]:
+    """What could not be compared, and why."""
+    for record in job.stages.records:
+        yield from record.counts.get(evaluation.PROBLEMS, ())
+
+
 def warnings_of(job: Job) -> Iterator[str]:
     """What a user should look at first."""
     yield from holding_out.left_out_words(job.capture, job.split)
     yield from filter(None, [missed_quality(job)])
+    yield from problems_of(job)
     unseen = job.base_reader.n_texels - len(job.seen_texels)
     if unseen:
         share = unseen / job.base_reader.n_texels
@@ -268,12 +275,20 @@ def _choices_sections(job: Job) -> Iterator[Section]:
     tried, pairs = [], []
     for candidate in found.tried:
         folder = job.stages.root / choices.STAGE / candidate.name
-        pairs.append(RelitPairs(job.held_frames, folder / "heldout"))
+        comparison = evaluation.read_comparison(folder / "heldout.json")
+        if comparison is None:
+            return
+        relit = RelitPairs(
+            job.held_frames,
+            folder / "heldout",
+            evaluation.silhouettes_of_frames(job, "heldout", job.held_frames),
+        )
+        pairs.append(relit.measured_in(comparison))
         tried.append(
             sections.TriedField(
                 _variant(
                     candidate.name,
-                    {"heldout": compare_frames(pairs[-1])},
+                    {"heldout": comparison},
                     json.loads((folder / "field.json").read_text()),
                 ),
                 seconds=sum(r["seconds"] for r in records[candidate.name]),

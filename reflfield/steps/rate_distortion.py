@@ -12,12 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.comparison.heldout import compare_with_photographs
+from reflfield.comparison.metrics import NothingToMeasure
 from reflfield.comparison.sections import RatePoint
 from reflfield.field.file import PackedSizes
 from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
 from reflfield.progress import track
-from reflfield.steps.evaluation import MAIN, frame_sets, variants, within_memory
+from reflfield.steps.evaluation import (
+    MAIN,
+    frame_sets,
+    silhouettes_of_frames,
+    variants,
+    within_memory,
+)
 from reflfield.steps.job import Job
 from reflfield.steps.quantising import FieldMaker
 
@@ -77,8 +84,12 @@ def _point(
     if "heldout" in sets:
         options = within_memory(job.options.relighting, job.resources)
         with TemporaryDirectory() as scratch:
-            comparison, _ = compare_with_photographs(
-                field, sets["heldout"], Path(scratch), options
-            )
-        heldout = comparison.mean["psnr_ldr"]
+            frames = sets["heldout"]
+            silhouettes = silhouettes_of_frames(job, "heldout", frames)
+            try:
+                heldout = compare_with_photographs(
+                    field, frames, silhouettes, Path(scratch), options
+                ).mean["psnr_ldr"]
+            except NothingToMeasure:
+                heldout = None
     return RatePoint(curve, size, maker.quality(field), heldout)

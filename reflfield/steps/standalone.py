@@ -1,17 +1,53 @@
-"""Comparison of a field with any frames, outside a run."""
+"""Relighting and comparison of a field with any frames, outside a run."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from reflfield.capture.model import Capture
 from reflfield.comparison import sections
-from reflfield.comparison.heldout import compare_with_photographs
+from reflfield.comparison.coverage import write_frame_silhouettes
+from reflfield.comparison.heldout import RelitPairs, compare_with_photographs
 from reflfield.comparison.metrics import Comparison, metrics_text
 from reflfield.comparison.report import ReportContent, write_report
+from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField
-from reflfield.files import replacing
+from reflfield.files import filling
+from reflfield.geometry.mesh import Mesh
+from reflfield.relighting.frames import relight_frames
 from reflfield.relighting.renderer import RenderOptions
+
+
+def write_relit_frames(
+    field: ReflectanceField, frames: Capture, out: Path, options: RenderOptions
+) -> list[Path]:
+    """Relight frames; all files, or none after an error.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    frames : Capture
+        Whose photographs are not read, and need not be there.
+    out : Path
+        Gets NAME.exr and NAME.png of every frame.
+    options : RenderOptions
+
+    Returns
+    -------
+    list of Path
+        The EXR files, in the order of the frames.
+
+    Raises
+    ------
+    InputError
+        If a frame cannot be relit, or a file of the frames would be replaced.
+    """
+    check_kept(frames, _pictures(frames, out))
+    with filling(out) as partial:
+        made = [frame.exr for frame in relight_frames(field, frames, partial, options)]
+    return [out / path.name for path in made]
 
 
 def write_standalone_comparison(
@@ -23,21 +59,42 @@ def write_standalone_comparison(
     ----------
     field : ReflectanceField
     frames : Capture
-        With photographs.
+        With photographs. Views without a silhouette get one made from their photographs if
+        they are enough, else the field's own surface as the camera sees it.
     out : Path
-        Gets ``relit/``, ``metrics.json`` and ``report/index.html``.
+        Gets ``relit/``, ``metrics.json`` and ``report/index.html``: all, or nothing after an
+        error.
     options : RenderOptions
 
     Returns
     -------
     Comparison
+
+    Raises
+    ------
+    InputError
+        If no frame can be compared, or a file of the frames would be replaced.
+    NumericalError
+        If what the field shows is not finite.
     """
-    comparison, pairs = compare_with_photographs(field, frames, out / "relit", options)
-    with replacing(out / "metrics.json") as partial:
-        partial.write_text(metrics_text(comparison.to_dict()))
-    (out / "report").mkdir(exist_ok=True)
-    content = ReportContent(
-        title=f"{field.metadata.get('capture', 'field')} against {frames.name}",
+    pages = [out / "metrics.json", out / "report" / "index.html"]
+    check_kept(frames, [*pages, *_pictures(frames, out / "relit")])
+    with TemporaryDirectory() as scratch, filling(out) as partial:
+        silhouettes = write_frame_silhouettes(
+            frames, frames, Mesh(field.positions, field.faces), Path(scratch), options.workers
+        )
+        comparison = compare_with_photographs(
+            field, frames, silhouettes, partial / "relit", options
+        )
+        pairs = RelitPairs(frames, partial / "relit", silhouettes).measured_in(comparison)
+        (partial / "metrics.json").write_text(metrics_text(comparison.to_dict()))
+        write_report(partial / "report" / "index.html", _page(field, comparison, pairs))
+    return comparison
+
+
+def _page(field: ReflectanceField, comparison: Comparison, pairs: RelitPairs) -> ReportContent:
+    return ReportContent(
+        title=f"{field.metadata.get('capture', 'field')} against {pairs.frames.name}",
         subtitle=f"{len(pairs)} frames",
         key_numbers=sections.key_numbers(comparison),
         sections=(
@@ -49,5 +106,27 @@ def write_standalone_comparison(
             ),
         ),
     )
-    write_report(out / "report" / "index.html", content)
-    return comparison
+
+
+def _pictures(frames: Capture, folder: Path) -> list[Path]:
+    names = [photograph.name for photograph in frames.photographs]
+    return [folder / f"{name}.{kind}" for name in names for kind in ("exr", "png")]
+
+
+def check_kept(frames: Capture, written: Iterable[Path]) -> None:
+    """Refuse to write over files that frames are read from.
+
+    Raises
+    ------
+    InputError
+        Naming the first of them.
+    """
+    read = {e.path.resolve() for p in frames.photographs for e in p.exposures}
+    read |= {path.resolve() for path in frames.silhouettes if path is not None}
+    read |= {light.file.resolve() for light in frames.lights if light.file is not None}
+    for path in written:
+        if path.resolve() in read:
+            raise InputError(
+                f"{path}: expected a folder for results where no file of the frames is "
+                "replaced, received one with this file; choose another folder"
+            )

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import flip_evaluator
 import numpy as np
@@ -14,7 +15,9 @@ from skimage.metrics import structural_similarity
 from reflfield.comparison.metrics import (
     PIXELS_PER_DEGREE,
     PSNR_CAP_DB,
+    Comparison,
     FramePair,
+    NothingToMeasure,
     common_exposure,
     compare_frames,
     object_pixels,
@@ -114,8 +117,17 @@ def test_equal_pictures_are_perfect_and_the_file_stays_valid(frames):
 def test_file_holds_exactly_what_is_promised(frames):
     content = json.loads(compare_frames(frames).to_json())
     keys = {"name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
-    assert set(content) == {"frames", "mean", "extra"}
-    assert all(set(frame) == keys for frame in content["frames"])
+    assert set(content) == {"frames", "mean", "measured", "extra"}
+    assert all(
+        set(frame) == keys | {"n_excluded", "silhouette_from"} for frame in content["frames"]
+    )
+    assert content["measured"] == {
+        "frames": 3,
+        "pixels": sum(int(object_pixels(pair.silhouette).sum()) for pair in frames),
+        "saturated_pixels_left_out": 0,
+        "silhouettes": {"given": 3},
+        "frames_not_measured": [],
+    }
     for key in keys - {"name"}:
         values = [frame[key] for frame in content["frames"]]
         assert content["mean"][key] == pytest.approx(np.mean(values), rel=1e-12)
@@ -225,10 +237,48 @@ def test_values_that_are_not_finite_are_refused_by_name(frames, what, value):
         compare_frames([frames[0], bad])
 
 
-def test_a_frame_without_object_is_refused_by_name(frames):
+def test_a_frame_without_object_is_left_out_by_name(frames):
     empty = FramePair("left_out", frames[0].photograph, frames[0].relit, np.zeros((40, 40)))
-    with pytest.raises(InputError, match=r"left_out.*received none"):
-        compare_frames([frames[0], empty])
+    result = compare_frames([frames[0], empty])
+    assert result.not_measured == ("left_out",)
+    assert result.frames == compare_frames([frames[0]]).frames
+    assert json.loads(result.to_json())["measured"]["frames_not_measured"] == ["left_out"]
+    with pytest.raises(NothingToMeasure, match="object pixel"):
+        compare_frames([empty])
+    with pytest.raises(NothingToMeasure, match="left_out have none"):
+        compare_frames([empty], exposure=1.0)
+
+
+def test_saturated_pixels_are_not_counted_and_change_nothing_else(frames):
+    a, b = frames[:2]
+    saturated = np.zeros((40, 40), bool)
+    saturated[18:21, 17:20] = True
+    # Whatever the field shows where the sensor was full: neither the pixels nor the windows
+    # of SSIM and FLIP around them see it.
+    results = []
+    for bright in (1.0, 50.0):
+        relit = np.where(saturated[..., None], bright * b.photograph, b.relit)
+        pair = replace(b, relit=relit, excluded=saturated)
+        results.append(compare_frames([a, pair], exposure=0.5).frames[1])
+    assert results[0] == results[1]
+    plain = compare_frames([a, b], exposure=0.5).frames[1]
+    counted = object_pixels(b.silhouette) & ~saturated
+    n = int((object_pixels(b.silhouette) & saturated).sum())
+    assert n == 9
+    assert (results[0].n_pixels, results[0].n_excluded) == (plain.n_pixels - n, n)
+    error = 0.5 * (b.photograph[counted] - b.relit[counted])
+    # The definition, computed here: rounding of a mean of a few thousand doubles.
+    assert results[0].psnr_hdr == pytest.approx(-10 * np.log10(np.mean(error**2)), rel=1e-12)
+
+
+def test_without_saturated_pixels_nothing_changes(frames):
+    none = [replace(pair, excluded=np.zeros((40, 40), bool)) for pair in frames]
+    assert compare_frames(none) == compare_frames(frames)
+
+
+def test_metrics_come_back_from_their_file(frames):
+    result = compare_frames(frames)
+    assert Comparison.from_dict(json.loads(result.to_json())) == result
 
 
 def test_sizes_that_differ_are_refused_by_name(frames):

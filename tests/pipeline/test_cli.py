@@ -8,11 +8,15 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from reflfield.capture.images import read_coverage, write_exr, write_png
 from rich.console import Console
 
 import reflfield as package
 import reflfield.cli as cli
+from reflfield.comparison.metrics import object_pixels
+from reflfield.errors import InputError
 from reflfield.progress import ProgressLines, listening, report
 
 COMMANDS = ("demo", "run", "relight", "compare", "inspect")
@@ -154,6 +158,96 @@ def test_compare_prints_and_writes_metrics(reflfield, finished, tiny_capture, tm
     assert "2 frames: PSNR" in outcome.out
     assert (out / "metrics.json").is_file()
     assert (out / "report" / "index.html").is_file()
+
+
+class TestNothingIsLeftAfterAnError:
+    """What was in the folder before stays, and nothing else is there."""
+
+    @pytest.fixture
+    def fails(self, monkeypatch):
+        """Function that lets a function fail when it is called for the second time."""
+
+        def arm(name, function):
+            calls = []
+
+            def second(*arguments, **named):
+                calls.append(arguments)
+                if len(calls) > 1:
+                    raise InputError("planted")
+                return function(*arguments, **named)
+
+            monkeypatch.setattr(name, second)
+
+        return arm
+
+    @pytest.mark.parametrize("before", [True, False])
+    @pytest.mark.parametrize("command", ["compare", "frames", "orbit"])
+    def test_it(self, reflfield, finished, tiny_capture, tmp_path, fails, command, before):
+        field, frames = finished.folder / "field.rfld", tiny_capture / "truth" / "heldout.json"
+        out = tmp_path / "deep" / "out"
+        if before:
+            out.mkdir(parents=True)
+            (out / "metrics.json").write_text("earlier")
+        fails(
+            "reflfield.relighting.frames.write_exr"
+            if command != "orbit"
+            else "reflfield.relighting.orbit.write_png",
+            write_exr if command != "orbit" else write_png,
+        )
+        words = {
+            "compare": ("compare", field, frames, "-o", out),
+            "frames": ("relight", field, "--frames", frames, "-o", out),
+            "orbit": ("relight", field, "--orbit", "2", "--light", "1,0,1", "--size", "32",
+                      "-o", out),
+        }[command]  # fmt: skip
+        outcome = reflfield(*words, "--samples", "1")
+        assert outcome.status == 2
+        assert "planted" in outcome.err
+        left = [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))]
+        assert left == (["deep", "deep/out", "deep/out/metrics.json"] if before else [])
+        if before:
+            assert (out / "metrics.json").read_text() == "earlier"
+
+    def test_own_output_among_the_frames_is_no_input(
+        self, reflfield, finished, capture_copy, tmp_path
+    ):
+        """Into the folder of the frames, twice; never over a photograph."""
+        field, photographs = finished.folder / "field.rfld", capture_copy / "photographs"
+        before = {path.name: path.read_bytes() for path in photographs.iterdir()}
+        for _ in range(2):
+            words = ("compare", field, capture_copy, "-o", capture_copy, "--samples", "1")
+            assert reflfield(*words).status == 0
+        words = ("relight", field, "--frames", capture_copy, "-o", photographs)
+        outcome = reflfield(*words, "--samples", "1")
+        assert outcome.status == 2
+        assert "v000_l000.exr: expected a folder for results" in outcome.err
+        assert {path.name: path.read_bytes() for path in photographs.iterdir()} == before
+
+
+def test_compare_without_silhouettes_measures_the_whole_object(
+    reflfield, finished, capture_copy, described, tmp_path
+):
+    """A dark frame and one lit from the side: the field's own surface says where it is."""
+
+    def two_frames(document):
+        for camera in document["cameras"]:
+            del camera["silhouette"]
+        document["photographs"] = [
+            {"camera": "v005", "light": light, "file": f"photographs/v005_{light}.exr"}
+            for light in ("l000", "l002")
+        ]
+
+    described(capture_copy, two_frames)
+    write_exr(capture_copy / "photographs" / "v005_l002.exr", np.zeros((32, 32, 3), np.float32))
+    words = ("compare", finished.folder / "field.rfld", capture_copy, "-o", tmp_path / "out")
+    outcome = reflfield(*words, "--samples", "1")
+    assert outcome.status == 0, outcome.err
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    truth = read_coverage(capture_copy / "silhouettes" / "v005.png")
+    # The hull's outline is within a pixel of the object's: 60 pixels of the 360 lie on it.
+    assert [f["silhouette_from"] for f in metrics["frames"]] == ["hull", "hull"]
+    for frame in metrics["frames"]:
+        assert frame["n_pixels"] == pytest.approx(object_pixels(truth).sum(), abs=30)
 
 
 @pytest.mark.parametrize("what", ["capture", "field", "frames"])

@@ -105,8 +105,17 @@ class TestWhatARunLeaves:
     def test_metrics_have_the_documented_keys(self, finished):
         metrics = json.loads((finished.folder / "metrics.json").read_text())
         measured = {"psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
-        assert set(metrics) == {"frames", "mean"}
-        assert [set(frame) for frame in metrics["frames"]] == [{"name"} | measured]
+        assert set(metrics) == {"frames", "mean", "measured", "held_out"}
+        told = {"name", "n_excluded", "silhouette_from"}
+        assert [set(frame) for frame in metrics["frames"]] == [told | measured]
+        assert metrics["measured"]["silhouettes"] == {"given": 1}
+        assert metrics["measured"]["pixels"] == metrics["mean"]["n_pixels"] > 200
+        assert metrics["held_out"] == {
+            "kind": "both",
+            "photographs_compared": 1,
+            "photographs_used_for_neither": 14,
+            "photographs_of_the_field": 45,
+        }
         assert set(metrics["mean"]) == measured
         assert metrics["frames"][0]["name"].startswith("v")
 

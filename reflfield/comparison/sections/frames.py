@@ -17,7 +17,6 @@ from reflfield.comparison.metrics import (
     FrameMetrics,
     FramePair,
     flip_map,
-    object_pixels,
     without_backdrop,
     worst_to_best,
 )
@@ -112,8 +111,8 @@ def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> Com
         for image in (np.asarray(pair.photograph), np.asarray(pair.relit))
     )
     error = flip_map(*(display(image, exposure) for image in without_backdrop(pair)))
-    counted = object_pixels(pair.silhouette)
-    return ComparedRow(metrics, photograph, relit, np.where(counted, error, np.nan)[box])
+    shown = np.where(pair.counted, error, np.nan)[box]
+    return ComparedRow(metrics, photograph, relit, shown)
 
 
 def flip_scale(errors: Sequence[NDArray[np.float64]]) -> float:
@@ -139,7 +138,8 @@ def _row_figure(row: ComparedRow, high: float, *, has_bar: bool) -> Figure:
             Panel(error_panel(row, high), f"FLIP error, 0 to {high:g}"),
         ),
         f"PSNR {m.psnr_ldr:.2f} dB (HDR {m.psnr_hdr:.2f} dB) · SSIM {m.ssim:.3f} · "
-        f"FLIP {m.flip:.3f} · {m.n_pixels} object pixels",
+        f"FLIP {m.flip:.3f} · {m.n_pixels} object pixels"
+        + (f", {m.n_excluded} saturated ones left out" if m.n_excluded else ""),
         title=m.name,
         colour_bar=ColourBar("magma", 0.0, high, FLIP_LABEL) if has_bar else None,
         min_width=0,
@@ -152,8 +152,34 @@ def _notes_on(comparison: Comparison) -> Note:
         f"All pictures at one exposure, {comparison.exposure:.4g}; nothing is rescaled per "
         "picture. Rows go from the worst frame to the best. Look for missing or smeared "
         "highlights, shadows with soft or displaced edges, and double contours. Brightness "
-        f"relit / photograph, mean over frames, R / G / B: {ratio} (1 is without bias)."
+        f"relit / photograph, mean over frames, R / G / B: {ratio} (1 is without bias). "
+        f"{measured_words(comparison)}"
     )
+
+
+# What a silhouette's origin means to a reader.
+ORIGIN_WORDS = {
+    "given": "given with the photographs",
+    "alpha": "the alpha of the photographs of their cameras",
+    "photographs": "made from all photographs of their cameras",
+    "hull": "the base surface as the cameras see it (too few photographs of those cameras)",
+    "image": "the whole image",
+}
+
+
+def measured_words(comparison: Comparison) -> str:
+    """On what the measures were taken, in a sentence or two."""
+    measured = comparison.measured
+    words = "; ".join(
+        f"{count} {ORIGIN_WORDS.get(origin, origin)}"
+        for origin, count in measured["silhouettes"].items()
+    )
+    text = f"Measured on {measured['pixels']} pixels of the object. Silhouettes: {words}."
+    if n := measured["saturated_pixels_left_out"]:
+        text += f" {n} pixels of the object are saturated in the photographs and left out."
+    if names := measured["frames_not_measured"]:
+        text += f" Not measured, since they show no pixel of the object: {', '.join(names)}."
+    return text
 
 
 def _distribution(comparison: Comparison) -> Figure:
