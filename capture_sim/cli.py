@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -23,14 +24,15 @@ from rich.table import Table
 
 from capture_sim.dome import rig_presets
 from capture_sim.effects.registry import read_choice
-from capture_sim.errors import SceneError
+from capture_sim.errors import SceneError, shown
+from capture_sim.inputs import memory_limit
 from capture_sim.materials import material_presets
 from capture_sim.memory import parse_bytes
 from capture_sim.objects import object_presets
 from capture_sim.plan import plan as make_plan
 from capture_sim.record import table_lines
 from capture_sim.scene import Scene, load_scene, shipped_scenes
-from capture_sim.write import write_capture
+from capture_sim.write import MOST_WORKERS, write_capture
 
 app = typer.Typer(
     help="Simulate photographs of an object in a dome of cameras and lights.",
@@ -51,6 +53,11 @@ EffectsOption = Annotated[
 ]
 
 
+MemoryOption = Annotated[
+    str, typer.Option(metavar="SIZE", help="Ceiling of resident memory, such as 800MB.")
+]
+
+
 def _loaded(scene: str, effects: str | None) -> Scene:
     """Scene with the choice of effects of the command line, if there is one."""
     loaded = load_scene(scene)
@@ -65,43 +72,50 @@ def _loaded(scene: str, effects: str | None) -> Scene:
 def render(
     scene: SceneArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the capture.")],
-    workers: Annotated[int, typer.Option(min=1, help="Views rendered at the same time.")] = min(
-        os.cpu_count() or 1, 8
-    ),
-    max_memory: Annotated[
-        str, typer.Option(metavar="SIZE", help="Ceiling of resident memory, such as 800MB.")
-    ] = "4GB",
+    workers: Annotated[
+        int, typer.Option(min=1, max=MOST_WORKERS, help="Views rendered at the same time.")
+    ] = min(os.cpu_count() or 1, 8),
+    max_memory: MemoryOption = "4GB",
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier capture in the folder.")
     ] = False,
     effects: EffectsOption = None,
     contributions: Annotated[
         int,
-        typer.Option(min=0, help="Photographs to write each effect's contribution for."),
+        typer.Option(
+            min=0, max=4096, help="Photographs to write each effect's contribution for."
+        ),
     ] = 0,
 ) -> None:
     """Simulate a capture: photographs, silhouettes, calibration and truth."""
-    loaded = _loaded(scene, effects)
-    for note in loaded.mesh.notes:
-        print(f"capture-sim: repaired {note}", file=sys.stderr)
-    with _progress_bar() as bar:
-        write_capture(
-            loaded,
-            output,
-            workers=workers,
-            max_memory=parse_bytes(max_memory),
-            overwrite=overwrite,
-            n_contributions=contributions,
-            progress=_shown_by(bar),
-        )
+    ceiling = parse_bytes(max_memory)
+    with _interruptible("the same command goes on from here"), memory_limit(ceiling):
+        loaded = _loaded(scene, effects)
+        for note in loaded.mesh.notes:
+            print(f"capture-sim: repaired {shown(note)}", file=sys.stderr)
+        with _progress_bar() as bar:
+            write_capture(
+                loaded,
+                output,
+                workers=workers,
+                max_memory=ceiling,
+                overwrite=overwrite,
+                n_contributions=contributions,
+                progress=_shown_by(bar),
+            )
     for line in [*table_lines(output), f"Wrote {output}"]:
         _console().print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 @app.command()
-def plan(scene: SceneArgument, effects: EffectsOption = None) -> None:
+def plan(
+    scene: SceneArgument, max_memory: MemoryOption = "4GB", effects: EffectsOption = None
+) -> None:
     """Show what would be simulated, why, and its cost, without doing it."""
-    for line in make_plan(_loaded(scene, effects)).lines():
+    ceiling = parse_bytes(max_memory)
+    with _interruptible("nothing was written"), memory_limit(ceiling):
+        lines = make_plan(_loaded(scene, effects), max_memory=ceiling).lines()
+    for line in lines:
         _console().print(line, highlight=False, soft_wrap=True, markup=False)
 
 
@@ -134,13 +148,15 @@ def _one_line(preset: Mapping[str, Any]) -> str:
 
 
 def _progress_bar() -> Progress:
+    console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=console,
         transient=True,
+        disable=not console.is_terminal,
     )
 
 
@@ -165,6 +181,25 @@ def main() -> None:
     """Run the command; scenes and files that cannot be used end with status 2."""
     try:
         app()
-    except (SceneError, OSError) as error:
-        print(f"capture-sim: {error}", file=sys.stderr)
-        sys.exit(2)
+    except SceneError as error:
+        _fail(str(error))
+    except OSError as error:  # a folder that cannot be written, a full disk
+        _fail(f"{error.filename or 'system'}: {error.strerror or error}")
+    except MemoryError:
+        _fail("system: expected more memory, received none; lower --max-memory or --workers")
+
+
+def _fail(message: str) -> NoReturn:
+    """Say what is wrong on one line and end with status 2."""
+    print(f"capture-sim: {shown(message)}", file=sys.stderr)
+    sys.exit(2)
+
+
+@contextmanager
+def _interruptible(left: str) -> Iterator[None]:
+    """End with status 130 and one line after Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"capture-sim: interrupted; {left}", file=sys.stderr)
+        sys.exit(130)

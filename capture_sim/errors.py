@@ -6,6 +6,9 @@ arrived, what to do.
 
 from __future__ import annotations
 
+# Characters of a value that a message shows.
+LONGEST_VALUE = 200
+
 
 class SceneError(ValueError):
     """A scene, or a file it names, holds something that cannot be simulated."""
@@ -32,6 +35,33 @@ def scene_error(what: str, expected: str, received: object, remedy: str = "") ->
     >>> str(scene_error("sphere.radius", "a number > 0", -1.0, "give metres"))
     'sphere.radius: expected a number > 0, received -1.0; give metres'
     """
-    shown = received if isinstance(received, str) else repr(received)
+    text = received if isinstance(received, str) else _short(received)
     ending = f"; {remedy}" if remedy else ""
-    return SceneError(f"{what}: expected {expected}, received {shown}{ending}")
+    return SceneError(f"{what}: expected {expected}, received {text}{ending}")
+
+
+def _short(value: object) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of too many digits, a deep nesting
+        text = f"one too long to be shown ({type(value).__name__})"
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}..."
+
+
+def shown(text: str) -> str:
+    r"""Text for one line of a terminal: characters that are not printable escaped.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(shown("vase" + chr(27) + "[2J of clay, é"))
+    vase\x1b[2J of clay, é
+    """
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

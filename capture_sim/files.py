@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import os
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,11 +19,13 @@ from PIL import Image
 from capture_sim.objects import SurfaceMesh
 
 _LARGEST_HALF = float(np.finfo(np.float16).max)
+# File systems without fsync of folders or of files opened for reading say one of these.
+_NO_FSYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.ENOSYS)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # zip members carry a date; this is the earliest
 
 
 def write_whole(path: Path, write: Callable[[Path, Any], None], values: Any) -> None:
-    """Write a file under another name first: what has its name is whole.
+    """Write a file under another name first: what has its name is whole, and on the disk.
 
     Parameters
     ----------
@@ -29,10 +33,45 @@ def write_whole(path: Path, write: Callable[[Path, Any], None], values: Any) -> 
     write : callable
         Writes values to a path.
     values : object
+
+    Raises
+    ------
+    OSError
+        Names the file.
     """
     beginning = path.with_name(f".{path.name}")
-    write(beginning, values)
-    beginning.rename(path)
+    try:
+        write(beginning, values)
+        flush_to_disk(beginning)
+    except OSError as failure:
+        beginning.unlink(missing_ok=True)
+        raise named_failure(failure, path) from failure
+    beginning.replace(path)
+
+
+def named_failure(failure: OSError, path: Path) -> OSError:
+    """The same failure with the name of the file that was being written."""
+    return OSError(failure.errno, failure.strerror or str(failure), str(path))
+
+
+def flush_to_disk(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except PermissionError:  # folders cannot be opened on Windows
+        return
+    try:
+        os.fsync(handle)
+    except OSError as failure:
+        if failure.errno not in _NO_FSYNC:
+            raise
+    finally:
+        os.close(handle)
 
 
 def write_exr(path: Path, radiance: NDArray[np.float32]) -> None:
@@ -46,8 +85,13 @@ def write_exr(path: Path, radiance: NDArray[np.float32]) -> None:
     fits = float(np.abs(radiance).max(initial=0.0)) <= _LARGEST_HALF
     pixels = np.ascontiguousarray(radiance, dtype=np.float16 if fits else np.float32)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"RGB": pixels}) as file:
-        file.write(str(path))
+    try:
+        with OpenEXR.File(header, {"RGB": pixels}) as file:
+            file.write(str(path))
+    except RuntimeError as failure:  # with the system's words at the end
+        codes = (code for code in errno.errorcode if os.strerror(code) in str(failure))
+        code = next(codes, errno.EIO)
+        raise OSError(code, os.strerror(code), str(path)) from failure
 
 
 def write_png(path: Path, encoded: NDArray[np.uint8]) -> None:
@@ -73,6 +117,17 @@ def write_silhouette(path: Path, coverage: NDArray[np.float32]) -> None:
     write_png(path, np.rint(coverage * 255.0).astype(np.uint8))
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write text as UTF-8.
+
+    Parameters
+    ----------
+    path : Path
+    text : str
+    """
+    path.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON types with the keys in their given order.
 
@@ -81,7 +136,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     path : Path
     content : mapping
     """
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

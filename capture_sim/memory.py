@@ -21,6 +21,7 @@ from capture_sim.effects import (
     subsurface,
 )
 from capture_sim.errors import scene_error
+from capture_sim.inputs import megabytes
 from capture_sim.model import Blocks, Scene
 from capture_sim.render import BYTES_PER_VALUE, lookup_nodes, rays_per_side
 from capture_sim.shading import BYTES_PER_PAIR
@@ -103,8 +104,8 @@ def fitted(scene: Scene, workers: int, max_memory: int, *, n_contributions: int 
         single = least_memory(scene, 1, n_contributions=n_contributions)
         raise scene_error(
             "--max-memory",
-            f"at least {_megabytes(least)} for {workers} workers, {_megabytes(single)} for one",
-            _megabytes(max_memory),
+            f"at least {megabytes(least)} for {workers} workers, {megabytes(single)} for one",
+            megabytes(max_memory),
             "raise it, or lower --workers, the size of the images or truth.points",
         )
     spare = max_memory - least
@@ -187,7 +188,3 @@ def _lights_at_once(scene: Scene, spare: int) -> int:
     fits = [n for n in (n_lights, *range(64 * (n_lights // 64), 0, -64), *range(63, 0, -1))
             if n <= n_lights and _kept(scene, n) - least <= TABLES * spare]  # fmt: skip
     return max(fits, default=1)
-
-
-def _megabytes(size: int) -> str:
-    return f"{math.ceil(size / (1 << 20))} MB"

@@ -19,6 +19,7 @@ from capture_sim.brightness import measured, spread
 from capture_sim.effects import Cost, Effect, Workload, simulated
 from capture_sim.effects.registry import EFFECTS
 from capture_sim.files import write_exr
+from capture_sim.memory import fitted
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
 from capture_sim.record import bound_text
@@ -118,20 +119,29 @@ def _cost_text(cost: Cost) -> str:
     return f"{cost.operations / 1e6:.1f}M" if cost.operations else "0"
 
 
-def plan(scene: Scene) -> Plan:
+def plan(scene: Scene, *, max_memory: int | None = None) -> Plan:
     """Decide on the effects of a scene and estimate its cost on this machine.
 
     Parameters
     ----------
     scene : Scene
+    max_memory : int, optional
+        Ceiling of this process' resident memory, bytes, with one worker.
 
     Returns
     -------
     Plan
         Its times depend on how busy the machine is.
+
+    Raises
+    ------
+    SceneError
+        If the memory does not suffice for the scene.
     """
     tracer = RayTracer(scene.mesh)
     scene = measured(scene, tracer)
+    if max_memory is not None:
+        scene = fitted(scene, 1, max_memory)
     trial = _run_trial(scene, tracer)
     n_views, n_lights = len(scene.cameras), len(scene.lights)
     points = trial.points_per_view * n_views

@@ -20,7 +20,7 @@ from typing import Any
 from capture_sim.contributions import Contribution
 from capture_sim.effects import Effect, simulated, threshold
 from capture_sim.effects.registry import EFFECTS
-from capture_sim.files import write_exr, write_json
+from capture_sim.files import write_exr, write_json, write_whole
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup
 
@@ -46,7 +46,7 @@ def write_record(setup: Setup, contributed: list[Contribution], folder: Path) ->
         Entries for ``truth/truth.json``: which file is what.
     """
     by_name = {one.name: one for one in contributed}
-    write_json(folder / EFFECTS_FILE, effects_record(setup.scene, by_name))
+    write_whole(folder / EFFECTS_FILE, write_json, effects_record(setup.scene, by_name))
     listing = {"effects": EFFECTS_FILE}
     for one in contributed:
         _write_differences(setup.scene, one, folder / "truth" / "contributions" / one.name)
@@ -54,7 +54,7 @@ def write_record(setup: Setup, contributed: list[Contribution], folder: Path) ->
     if setup.differs:
         lights = [dict(light) for light in setup.rig.lights]
         cameras = [dict(camera) for camera in setup.rig.cameras]
-        write_json(folder / RIG_FILE, {"cameras": cameras, "lights": lights})
+        write_whole(folder / RIG_FILE, write_json, {"cameras": cameras, "lights": lights})
         listing["rig"] = RIG_FILE
     return listing
 
@@ -109,7 +109,7 @@ def _write_differences(scene: Scene, one: Contribution, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for (view, light), difference in one.differences.items():
         name = f"{scene.cameras[view]['id']}_{scene.lights[light]['id']}.exr"
-        write_exr(folder / name, difference)
+        write_whole(folder / name, write_exr, difference)
 
 
 def table_lines(folder: Path) -> list[str]:

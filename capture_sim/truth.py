@@ -69,7 +69,7 @@ def write_truth(
     truth = folder / "truth"
     truth.mkdir(exist_ok=True)
     listing: dict[str, Any] = {"version": 1, "mesh": "truth/mesh.ply"}
-    write_ply(truth / "mesh.ply", scene.mesh)
+    write_whole(truth / "mesh.ply", write_ply, scene.mesh)
     if scene.truth.per_view:
         listing["views"] = "truth/views/{camera}.npz"
     if ideal.heldout_frames:
@@ -77,8 +77,8 @@ def write_truth(
         _write_heldout(ideal, tracer, truth)
     if scene.truth.points:
         listing["abrdf"] = "truth/abrdf.npz"
-        write_npz(truth / "abrdf.npz", apparent_brdfs(scene, tracer))
-    write_json(truth / "truth.json", {**listing, **more})
+        write_whole(truth / "abrdf.npz", write_npz, apparent_brdfs(scene, tracer))
+    write_whole(truth / "truth.json", write_json, {**listing, **more})
 
 
 def write_view_truth(scene: Scene, tracer: RayTracer, camera: Table, folder: Path) -> None:
@@ -272,7 +272,8 @@ def _write_heldout(scene: Scene, tracer: RayTracer, truth: Path) -> None:
         view = sample_view(scene, tracer, camera)
         image = f"heldout/{camera['id']}.exr"
         silhouette = f"heldout/{camera['id']}_silhouette.png"
-        write_exr(truth / image, shade(scene, tracer, view, (light,))[0])
-        write_silhouette(truth / silhouette, view.coverage)
+        write_whole(truth / image, write_exr, shade(scene, tracer, view, (light,))[0])
+        write_whole(truth / silhouette, write_silhouette, view.coverage)
         frames.append(transforms_frame(camera, light, image, silhouette))
-    write_json(truth / "heldout.json", {"camera_model": "OPENCV", "frames": frames})
+    description = {"camera_model": "OPENCV", "frames": frames}
+    write_whole(truth / "heldout.json", write_json, description)

@@ -1,13 +1,8 @@
-"""The native capture directory, version 1.
-
-Everything goes to a hidden folder beside the target, which is renamed when
-complete: a capture is either there and whole, or not there. What was interrupted
-stays in the hidden folder, each file of it whole, and the same command goes on from there.
-"""
+"""The native capture directory, version 1; `capture_sim.destination` says where it is made."""
 
 from __future__ import annotations
 
-import shutil
+import os
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -20,6 +15,15 @@ from numpy.typing import NDArray
 
 from capture_sim.brightness import measured
 from capture_sim.contributions import contributions, some_pairs
+from capture_sim.destination import (
+    CAPTURE_FILE,
+    begin,
+    begun_for,
+    check_target,
+    finish,
+    publish,
+    reserved,
+)
 from capture_sim.effects import Frame, exposure_brackets, simulated
 from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
@@ -45,8 +49,7 @@ Table = Mapping[str, Any]
 Lights = NDArray[np.intp]
 
 GENERATOR = "capture_sim"
-CAPTURE_FILE = "capture.json"
-FINGERPRINT_FILE = "scene.sha256"
+MOST_WORKERS = 1024
 
 # (photographs done, photographs in all); first with those that are there already.
 Progress = Callable[[int, int], None]
@@ -73,7 +76,7 @@ def write_capture(
         `max_memory`. Photographs of the same scene that an interrupted call left are
         taken over.
     workers : int
-        Views rendered at the same time.
+        Views rendered at the same time, 1 to 1024.
     max_memory : int, optional
         Ceiling of this process' resident memory, bytes; see `capture_sim.memory`.
     overwrite : bool
@@ -92,81 +95,51 @@ def write_capture(
     Raises
     ------
     SceneError
-        If the folder exists and may not be replaced, or the memory does not suffice.
+        If the folder exists and may not be replaced, another process writes to it, or the
+        memory does not suffice.
+    OSError
+        If a file cannot be written; names it.
     """
-    check_target(folder, overwrite=overwrite)
-    # One thread traces at a time, on behalf of all.
-    tracer = RayTracer(scene.mesh, n_threads=workers)
-    known = measured(scene, tracer)
-    if max_memory is not None:
-        known = fitted(known, workers, max_memory, n_contributions=n_contributions)
-    setup, part = set_up(known), _begun(scene, folder)
-    _write_views(setup, tracer, part, workers, progress or _no_progress)
-    _write_rest(setup, tracer, part, n_contributions)
-    (part / FINGERPRINT_FILE).unlink()
-    _move_into_place(part, folder)
+    target, mark = Path(os.path.abspath(folder)), fingerprint(scene)  # noqa: PTH100
+    check_workers(workers)
+    with reserved(target) as part:
+        known = begun_for(part) == mark
+        if finish(part, target) and known:
+            return folder
+        check_target(target, overwrite=overwrite)
+        # One thread traces at a time, on behalf of all.
+        tracer = RayTracer(scene.mesh, n_threads=min(workers, os.cpu_count() or 1))
+        ready = measured(scene, tracer)
+        if max_memory is not None:
+            ready = fitted(ready, workers, max_memory, n_contributions=n_contributions)
+        setup = set_up(ready)
+        begin(part, mark)
+        _write_views(setup, tracer, part, workers, progress or _no_progress)
+        _write_rest(setup, tracer, part, n_contributions)
+        publish(part, target, overwrite=overwrite)
     return folder
 
 
-def _begun(scene: Scene, folder: Path) -> Path:
-    """The hidden folder, with what an interrupted call for the same scene left in it."""
-    part = folder.parent / f".{folder.name}.incomplete"
-    mark, file = fingerprint(scene), part / FINGERPRINT_FILE
-    if file.is_file() and file.read_text(encoding="ascii") == mark:
-        return part
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    file.write_text(mark, encoding="ascii")
-    return part
-
-
-def _no_progress(done: int, total: int) -> None:
-    """Tell nobody."""
-
-
-def check_target(folder: Path, *, overwrite: bool) -> None:
-    """Refuse a folder that may not be written.
+def check_workers(workers: int) -> None:
+    """Refuse numbers of threads that no machine has.
 
     Parameters
     ----------
-    folder : Path
-        Where a capture is to go.
-    overwrite : bool
-        True if an earlier capture may be replaced.
+    workers : int
 
     Raises
     ------
     SceneError
-        If there is a file, a folder that holds something else, or a capture
-        that may not be replaced.
+        If it is not in the range.
     """
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise scene_error(str(folder), "a folder or nothing", "a file", "choose another place")
-    if (folder / CAPTURE_FILE).is_file():
-        if not overwrite:
-            raise scene_error(
-                str(folder), "no capture there yet", "one", "pass --overwrite to replace it"
-            )
-    elif any(folder.iterdir()):
+    if not 1 <= workers <= MOST_WORKERS:
         raise scene_error(
-            str(folder),
-            "an empty folder or an earlier capture",
-            f"a folder without {CAPTURE_FILE}",
-            "choose another place; it is not deleted",
+            "workers", f"1 to {MOST_WORKERS}", workers, "one for each processor core is most"
         )
 
 
-def _move_into_place(part: Path, folder: Path) -> None:
-    if not folder.exists():
-        part.rename(folder)
-        return
-    old = folder.parent / f".{folder.name}.replaced"
-    shutil.rmtree(old, ignore_errors=True)
-    folder.rename(old)
-    part.rename(folder)
-    shutil.rmtree(old)
+def _no_progress(done: int, total: int) -> None:
+    """Tell nobody."""
 
 
 class _Tally:
@@ -231,7 +204,7 @@ def _groups(scene: Scene) -> list[Lights]:
 
 def _for_all(count: int, work: Callable[[int], None], workers: int) -> None:
     """Do some work for all indices, some of them at the same time; stop at an error."""
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(min(workers, count)) as pool:
         futures = [pool.submit(work, index) for index in range(count)]
         try:
             for future in as_completed(futures):
@@ -249,7 +222,7 @@ def _write_rest(setup: Setup, tracer: RayTracer, folder: Path, n_contributions: 
     (folder / "truth").mkdir(exist_ok=True)
     more = write_record(setup, contributed, folder)
     write_truth(setup.real, tracer, folder, ideal=setup.reported, more=more)
-    write_json(folder / CAPTURE_FILE, capture_description(setup))
+    write_whole(folder / CAPTURE_FILE, write_json, capture_description(setup))
 
 
 def _write_view(

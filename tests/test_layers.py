@@ -38,8 +38,9 @@ ROOMS = (
     "demo",
     "cli",
 )
-# Commands import what they need when they run, so that --help answers at once.
-IMPORTS_LATE = {Path("reflfield/cli.py")}
+# Commands import what they need when they run, so that --help answers at once and Ctrl-C
+# is heard while libraries are imported.
+IMPORTS_LATE = {Path("reflfield/cli.py"), Path("capture_sim/__main__.py")}
 
 
 class Import(NamedTuple):

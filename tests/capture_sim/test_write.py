@@ -63,6 +63,7 @@ def test_all_files_are_there(capture):
     assert files_of(capture) == sorted(
         [
             "capture.json",
+            "files.json",
             "truth/truth.json",
             "truth/mesh.ply",
             "truth/abrdf.npz",
@@ -90,7 +91,7 @@ def test_bytes_do_not_depend_on_the_workers(capture, tmp_path):
     files = [name for name in files_of(capture) if name != "truth/effects.json"]  # times
     same, different, missing = filecmp.cmpfiles(capture, again, files, shallow=False)
     assert (different, missing) == ([], [])
-    assert len(same) == 24
+    assert len(same) == 25
 
 
 def test_photographs_are_half_floats_and_lie_within_the_silhouette(capture):
@@ -138,10 +139,15 @@ def test_an_earlier_capture_is_replaced_only_on_request(tmp_path):
     target = write_capture(small, tmp_path / "capture")
     with pytest.raises(SceneError, match=r"capture: .*pass --overwrite to replace it"):
         write_capture(small, target)
-    (target / "stale.txt").write_text("old")
+    write_capture(scene(heldout={"frames": 1}, truth={"points": 0}), target, overwrite=True)
+    assert (target / "truth" / "heldout.json").is_file()
     write_capture(small, target, overwrite=True)
-    assert not (target / "stale.txt").exists()
+    assert not (target / "truth" / "views").exists()
+    assert not (target / "truth" / "heldout.json").exists()
     assert [p.name for p in tmp_path.iterdir()] == ["capture"]
+    assert sorted(p.name for p in target.iterdir()) == [
+        *("capture.json", "files.json", "photographs", "silhouettes", "truth")
+    ]
 
 
 def test_other_folders_and_files_are_never_replaced(tmp_path):
