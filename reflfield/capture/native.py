@@ -182,8 +182,15 @@ def _up(document: Mapping[str, Any], description: Path) -> NDArray[np.float64]:
 
 
 def _notes(document: Mapping[str, Any], description: Path) -> tuple[str, ...]:
-    """Keys that the schema allows and nothing reads."""
+    """Keys at the top that nothing reads; those of a camera or light are refused there."""
     unused = sorted(set(document) - set(schema()["properties"]))
+    parts = [part for part in schema()["$defs"].values() if "properties" in part]
+    misplaced = [key for key in unused if any(key in part["properties"] for part in parts)]
+    if misplaced:
+        raise CaptureError(
+            f"{description}: {misplaced[0]}: expected within a camera, light or photograph, "
+            "received it at the top, where it would be without effect; move it there"
+        )
     listed = ", ".join(quoted(key) for key in unused[:20])
     return (f"{description}: not used: {listed}",) if unused else ()
 
