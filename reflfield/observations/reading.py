@@ -23,6 +23,7 @@ from reflfield.observations.resampling import (
     side_for,
 )
 from reflfield.observations.store import Bools, ObservationStore, Observed
+from reflfield.sphere.hemisphere import softened_cosine
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -92,15 +93,22 @@ class SampleCount:
     unmeasured: int
 
 
-def luminance_of(texels: TexelSamples) -> Floats:
+def luminance_of(texels: TexelSamples, cosines: Floats) -> Floats:
     """Luminance (n, n_views, n_lights) of samples, in their unit; NaN of no channel.
 
     Where only some channels were measured the sample is taken to have the colour of its
-    texel: the mean of the samples of which all channels were measured, or, without any, of
-    each channel over the samples that have it. The luminance is what the channels have over
-    the share that they have of that colour's. Where all were measured this is the luminance
-    itself. Leaving such samples out would leave nothing of a capture under coloured lamps;
-    taking the missing channels for black would draw frames after the colours of the lamps.
+    texel: that of the matt surface which explains the samples best of which all channels
+    were measured, or, without any, the samples that have each channel. The luminance is what
+    the channels have over the share that they have of that colour's. Where all were measured
+    this is the luminance itself. Leaving such samples out would leave nothing of a capture
+    under coloured lamps; taking the missing channels for black would draw frames after the
+    colours of the lamps.
+
+    Parameters
+    ----------
+    texels : TexelSamples
+    cosines : (n, n_lights) float32
+        Of the lights to the texels' normals as far as they are known; not negative.
 
     Examples
     --------
@@ -110,26 +118,30 @@ def luminance_of(texels: TexelSamples) -> Floats:
     >>> one = np.array([[[0.0, 0, 1]]])
     >>> seen = np.ones((1, 2), bool)
     >>> few = TexelSamples(samples, one, one.repeat(2, 1), seen[:, :1], seen, seen[:1])
-    >>> luminance_of(few).round(4)
+    >>> luminance_of(few, np.ones((1, 2))).round(4)
     array([[[0.2353, 0.1176]]], dtype=float32)
     """
     values = texels.samples.astype(np.float32)
     if not texels.has_gaps or not (unmeasured := np.isnan(values)).any():
         return values @ LUMINANCE
     values = np.where(unmeasured, np.float32(0.0), values)
-    counted = ~unmeasured & texels.seen[..., None]
-    whole_samples = np.asarray(counted.all(axis=3))[..., None]
-    has_whole = np.asarray(whole_samples.any(axis=(1, 2)))[:, None, None]
-    counted = np.where(has_whole, whole_samples, counted)
-    total = np.einsum("nvlc,nvlc->nc", values, counted)
-    colour = total / np.maximum(np.count_nonzero(counted, axis=(1, 2)), 1) * LUMINANCE
+    colour = _matt_colour(values, ~unmeasured & texels.seen[..., None], cosines) * LUMINANCE
     whole = colour.sum(axis=1)[:, None, None]
     shown = np.einsum("nvlc,nc->nvl", ~unmeasured, colour)
     share = np.divide(shown, whole, out=np.zeros_like(shown), where=whole > 0)
-    partial = unmeasured.any(axis=3)
     known = values @ LUMINANCE
     scaled = np.divide(known, share, out=np.full_like(known, np.nan), where=share > 0)
-    return np.where(partial, scaled, known).astype(np.float32)
+    return np.where(unmeasured.any(axis=3), scaled, known).astype(np.float32)
+
+
+def _matt_colour(values: Floats, counted: Bools, cosines: Floats) -> Floats:
+    """Values (n, 3) over cosines by least squares, over whole samples where there are any."""
+    whole = np.asarray(counted.all(axis=3))[..., None]
+    has_whole = np.asarray(whole.any(axis=(1, 2)))[:, None, None]
+    counted = np.where(has_whole, whole, counted)
+    total = np.einsum("nvlc,nvlc,nl->nc", values, counted, cosines)
+    weight = np.einsum("nvlc,nl->nc", counted, np.square(cosines))
+    return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,11 +269,14 @@ class TexelReader:
         See `luminance_of` for samples of which not all channels were measured.
         """
         found = self.measured(texels)
-        values = luminance_of(found) * np.float32(found.unit)
-        samples = np.where(found.seen, values, np.float32(np.nan))
         frames = self.local_from_world[texels].astype(np.float64)
         views = local_directions(frames, found.views.astype(np.float64))
         lights = local_directions(frames, found.lights.astype(np.float64))
+        cosines = np.ones(lights.shape[:2], np.float32)
+        if self.sides[1] > 1:
+            cosines = softened_cosine(lights[..., 2]).astype(np.float32)
+        values = luminance_of(found, cosines) * np.float32(found.unit)
+        samples = np.where(found.seen, values, np.float32(np.nan))
         if self.sides[0] == 1:
             samples, views = _mean_over(samples, 1), _upright(len(texels))
         if self.sides[1] == 1:

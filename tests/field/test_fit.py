@@ -16,7 +16,7 @@ from reflfield.field.fit import (
     roughness,
     solve_coefficients,
 )
-from reflfield.observations.resampling import RootedSamples
+from reflfield.observations.resampling import CHANNEL_BITS, RootedSamples, all_channels
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 SIDES = (3, 3)
@@ -42,7 +42,11 @@ def random_weights(rng, n, k):
     return (rng.uniform(0.2, 1, (n, k)) * (rng.random((n, k)) < 0.8)).astype(np.float32)
 
 
-def empty_samples(rng, n, n_views, n_lights, sides=SIDES):
+def empty_samples(rng, n, n_views, n_lights, sides=SIDES, *, gaps=False):
+    """Random directions and weights; with `gaps`, a third of the values was not measured."""
+    channels = all_channels()
+    if gaps:
+        channels = (rng.random((n, n_views, n_lights, 3)) < 2 / 3) @ CHANNEL_BITS
     return RootedSamples(
         values=np.zeros((n, n_views, n_lights, 3), np.float32),
         view_taps=random_taps(rng, n, n_views, sides[0]),
@@ -50,6 +54,7 @@ def empty_samples(rng, n, n_views, n_lights, sides=SIDES):
         view_weights=random_weights(rng, n, n_views),
         light_weights=random_weights(rng, n, n_lights),
         pairs=(rng.random((n_views, n_lights)) < 0.9).astype(np.float32),
+        channels=channels,
     )
 
 
@@ -90,11 +95,15 @@ def sample_weights(samples):
     return samples.view_weights[:, :, None] * samples.light_weights[:, None] * samples.pairs
 
 
+def value_weights(samples):
+    """(n, n_views, n_lights, 3): none where a channel was not measured."""
+    return sample_weights(samples)[..., None] * samples.measured()
+
+
 def measured(samples, model, rng, sigma):
     values = predicted(samples, model)
-    return replace(
-        samples, values=(values + sigma * rng.normal(size=values.shape)).astype(np.float32)
-    )
+    values = values + sigma * rng.normal(size=values.shape)
+    return replace(samples, values=np.where(samples.measured(), values, 7).astype(np.float32))
 
 
 def part(samples, texels):
@@ -127,10 +136,11 @@ class TestModel:
 
 
 class TestNormalEquations:
-    @pytest.fixture
-    def setting(self, rng, pool):
+    @pytest.fixture(params=[False, True], ids=["whole", "gaps"])
+    def setting(self, rng, pool, request):
         model = planted_model(rng, 20)
-        samples = measured(empty_samples(rng, 20, 7, 6), model, rng, 0.1)
+        samples = empty_samples(rng, 20, 7, 6, gaps=request.param)
+        samples = measured(samples, model, rng, 0.1)
         return samples, model, problem_of(samples, model, pool)
 
     def test_are_symmetric_and_positive(self, setting, rng, rounding):
@@ -147,7 +157,7 @@ class TestNormalEquations:
     def test_energy_is_that_of_the_predictions(self, setting, rounding):
         """<x, A^T W A x> = |W^1/2 A x|^2 and <x, A^T W u> = <A x, W u>, by dense products."""
         samples, model, problem = setting
-        weights, values = sample_weights(samples)[..., None], predicted(samples, model)
+        weights, values = value_weights(samples), predicted(samples, model)
         energy = (weights * values**2).sum()
         got = (model.table * problem.sums(model.table, of_samples=False)).sum(dtype=float)
         assert abs(got - energy) < rounding(np.float32, 100, scale=energy)
@@ -157,7 +167,7 @@ class TestNormalEquations:
 
     def test_do_not_read_what_has_no_weight(self, setting, pool):
         samples, model, problem = setting
-        counted = sample_weights(samples)[..., None] > 0
+        counted = value_weights(samples) > 0
         other = problem_of(
             replace(samples, values=np.where(counted, samples.values, np.float32(9e9))),
             model,
@@ -207,19 +217,20 @@ class TestRoughness:
 
 class TestCoefficients:
     @pytest.mark.reference
-    def test_against_lstsq_with_prior(self, rng, pool, rounding):
+    @pytest.mark.parametrize("gaps", [False, True])
+    def test_against_lstsq_with_prior(self, rng, pool, rounding, gaps):
         model = planted_model(rng, 12)
         precision = np.array([[2.0, 0.3], [0.3, 1.0]])
         model = replace(model, precision=np.stack([precision, 3 * precision]))
-        samples = measured(empty_samples(rng, 12, 6, 5), model, rng, 0.1)
+        samples = measured(empty_samples(rng, 12, 6, 5, gaps=gaps), model, rng, 0.1)
         found, squares = solve_coefficients(samples, model.cluster, model, pool)
         columns = [
             predicted(samples, replace(model, coefficients=np.tile(row, (12, 1))))
             for row in np.array([[0, 0], [1, 0], [0, 1.0]])
         ]
-        weights = sample_weights(samples)
+        weights = value_weights(samples)
         for t in range(12):
-            half = np.repeat(np.sqrt(weights[t]).ravel(), 3)
+            half = np.sqrt(weights[t]).ravel()
             design = np.stack([(c - columns[0])[t].ravel() * half for c in columns[1:]], axis=1)
             rest = (samples.values[t] - columns[0][t]).ravel() * half
             prior = np.linalg.cholesky(model.precision[model.cluster[t]]).T
@@ -231,8 +242,8 @@ class TestCoefficients:
             assert np.isclose(squares[t, 0], left, rtol=1e-4)  # what is left of float32 sums
             full = design.T @ design
             determined = np.trace(np.linalg.solve(full + prior.T @ prior, full))
-            share = 1 - determined / (3 * np.count_nonzero(weights[t]))
-            freedom = 3 * weights[t].sum() * share
+            share = 1 - determined / np.count_nonzero(weights[t])
+            freedom = weights[t].sum() * share
             assert np.isclose(squares[t, 1], freedom, rtol=1e-5)
 
     def test_planted_coefficients(self, rng, pool):

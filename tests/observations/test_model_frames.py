@@ -12,7 +12,12 @@ from reflfield.field.frames import _add_texel, _gains, _own_function, improved_f
 from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import TexelReader
 from reflfield.observations.resampling import ResamplingOptions
-from reflfield.observations.store import ObservationStore, Observed, create_samples
+from reflfield.observations.store import (
+    ObservationStore,
+    Observed,
+    create_samples,
+    open_samples,
+)
 from reflfield.sphere.hemisphere import HemisphereGrid, place_directions, softened_cosine
 
 from .rigs import dome, interpolated, tilted_frames
@@ -90,6 +95,19 @@ def test_planted_frames_come_back(planted, model):
     assert before.mean() > 2.5
     assert np.median(after) < 0.02 * np.median(before)
     assert after.mean() < 0.1 * before.mean()
+
+
+def test_values_not_measured_have_no_say(planted, model, rng):
+    """Of half of the values nothing is known: frames come back from the others."""
+    reader, truth = planted
+    stored = open_samples(reader.store.location)
+    values = stored[:]
+    values[rng.random(values.shape) < 0.5] = np.nan
+    stored[:] = values
+    before = angles(reader.local_from_world, truth)
+    found = improved_frames(reader, model, np.arange(N), SPREAD)
+    # Less near than with all of them; were NaN a value, none would come back at all.
+    assert np.median(angles(found, truth)) < 0.06 * np.median(before)
 
 
 def test_texels_not_named_and_a_spread_of_nothing_keep_their_frames(planted, model):

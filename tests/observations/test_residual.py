@@ -11,7 +11,12 @@ from reflfield.field.synthetic import baked_field, blinn_phong, square_surface
 from reflfield.observations.projection import directions_of, pairs_photographed
 from reflfield.observations.reading import TexelReader
 from reflfield.observations.resampling import ResamplingOptions
-from reflfield.observations.store import ObservationStore, Observed, create_samples
+from reflfield.observations.store import (
+    ObservationStore,
+    Observed,
+    create_samples,
+    open_samples,
+)
 
 from .rigs import dome
 
@@ -60,6 +65,20 @@ def test_samples_of_the_field_itself_have_no_error(field, reader_of):
     found = sample_error(field, reader_of(1.0), np.arange(field.n_texels))
     assert found.linear < HALF
     assert found.cube_root < HALF
+
+
+def test_values_not_measured_do_not_count(field, reader_of, rng):
+    """Clipped highlights would be compared with what the field says of them."""
+    reader = reader_of(2.0)
+    stored = open_samples(reader.store.location)
+    values = stored[:]
+    values[rng.random(values.shape) < 0.3] = np.nan
+    stored[:] = values
+    found = sample_error(field, reader, np.arange(field.n_texels))
+    assert found.linear == pytest.approx(0.5, abs=2 * HALF)
+    seen = reader.store.observed
+    observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs
+    assert found.n_samples == (observed & ~np.isnan(values).all(axis=3)).sum()
 
 
 def test_error_is_relative_to_the_samples(field, reader_of):
