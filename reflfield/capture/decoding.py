@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import importlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,15 +59,15 @@ class StoredImage:
         Whether the file holds integers.
     premultiplied : bool
         Whether colour was multiplied by alpha before it was stored.
-    space : ColorSpace
-        As the file states it.
+    stated : callable
+        Gives the colour space that the file states, or refuses it.
     """
 
     colour: NDArray[Any]
     alpha: Float32 | None
     integer: bool
     premultiplied: bool
-    space: ColorSpace
+    stated: Callable[[], ColorSpace]
 
     @property
     def largest_code(self) -> int:
@@ -99,8 +100,7 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
     Raises
     ------
     CaptureError
-        If the file is damaged, truncated, of a kind of pixel that is no photograph, or states
-        a colour space that cannot be honoured.
+        If the file is damaged, truncated, or of a kind of pixel that is no photograph.
     """
     if header.kind == "raw":
         return _developed(path, header)
@@ -111,7 +111,8 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
         _check_pixels(path, header, layer, spec)
         wanted = [*names, *([alpha] if alpha else [])]
         pixels = _pixels(path, file, spec, header, layer, wanted)
-        space = stated_space(
+        stated = partial(
+            stated_space,
             path,
             header,
             layer.part,
@@ -128,7 +129,7 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
         alpha=_share(pixels[..., -1]) if alpha else None,
         integer=str(spec.format) in _INTEGERS,
         premultiplied=not straight,
-        space=space,
+        stated=stated,
     )
 
 
@@ -181,19 +182,16 @@ def _pixels(
     if missing:
         raise _damaged(path, f"no channel {missing[0]}")
     indices = [stored_names.index(name) for name in names]
-    first, last = min(indices), max(indices) + 1
-    check_size(
-        path, spec.width, spec.height * (last - first), len(indices) * path.stat().st_size
-    )
+    check_size(path, spec.width, spec.height, path.stat().st_size)
     stored_type = str(spec.format)
     wanted = "float" if stored_type in _FLOATS else stored_type
-    pixels = file.read_image(layer.part, 0, first, last, wanted)
+    together = indices == list(range(indices[0], indices[0] + len(indices)))
+    runs = [(indices[0], indices[-1] + 1)] if together else [(i, i + 1) for i in indices]
+    read = [file.read_image(layer.part, 0, *run, wanted) for run in runs]
     error = file.geterror()
-    if pixels is None or error:
+    if error or any(pixels is None for pixels in read):
         raise _damaged(path, error)
-    picked = [i - first for i in indices]
-    if picked != list(range(last - first)):
-        pixels = pixels[..., picked]
+    pixels = read[0] if together else np.concatenate(read, axis=2)
     if stored_type == "uint":
         pixels = (pixels / (2**32 - 1)).astype(np.float32)
     if header.kind == "exr":
@@ -300,6 +298,12 @@ def _developed(path: Path, header: ImageHeader) -> StoredImage:
     """A raw file, demosaiced: linear Rec.709, the camera's white balance, not brightened."""
     with _raw(path, header) as raw:
         check_size(path, raw.sizes.width, raw.sizes.height, path.stat().st_size)
+        unknown = _unknown(raw)
+        if unknown:
+            raise CaptureError(
+                f"{path}: expected a camera raw file that LibRaw knows, received one without "
+                f"{unknown} ({header.raw}); convert it to a 16-bit TIFF"
+            )
         pixels = raw.postprocess(
             gamma=(1, 1),
             no_auto_bright=True,
@@ -308,7 +312,18 @@ def _developed(path: Path, header: ImageHeader) -> StoredImage:
             output_color=raw_library().ColorSpace.sRGB,
             user_flip=0,  # as stored
         )
-    return StoredImage(pixels, None, True, False, ColorSpace(Encoding(LINEAR)))
+    return StoredImage(pixels, None, True, False, lambda: ColorSpace(Encoding(LINEAR)))
+
+
+def _unknown(raw: Any) -> str:
+    """What LibRaw does not know and would make up; empty if it is nothing."""
+    if raw.num_colors == 1:
+        return ""
+    if not raw.color_matrix.any() and not raw.rgb_xyz_matrix.any():
+        return "the camera's primaries"
+    if min(raw.camera_whitebalance[:3]) <= 0:
+        return "the camera's white balance"
+    return ""
 
 
 @contextmanager

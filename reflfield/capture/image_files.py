@@ -130,14 +130,18 @@ def read_exposure(
     stored = _read(path, reading)
     image = _linear(path, stored, reading, "photograph")
     measured = _measured(stored, reading)
-    encoding = (reading.encoding or stored.space.encoding) if stored.integer else None
-    if encoding is None or stored.alpha is not None or stored.space.matrix is not None:
+    space = _space(stored, reading)
+    if not stored.integer or stored.alpha is not None or space.matrix is not None:
         white = 1.0 if stored.integer else reading.white_level or 1.0
         values = encode_srgb(image / np.float32(white)).astype(np.float32)
         measured = measured & (values > 0) & (values < 1)
         return values, measured, Encoding(SRGB)
     shape = image.shape
-    return np.broadcast_to(stored.values, shape), np.broadcast_to(measured, shape), encoding
+    return (
+        np.broadcast_to(stored.values, shape),
+        np.broadcast_to(measured, shape),
+        space.encoding,
+    )
 
 
 def read_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> Float32 | None:
@@ -219,7 +223,7 @@ def _read(path: Path, reading: ImageReading) -> StoredImage:
 
 
 def _space(stored: StoredImage, reading: ImageReading) -> ColorSpace:
-    return stored.space if reading.encoding is None else ColorSpace(reading.encoding)
+    return stored.stated() if reading.encoding is None else ColorSpace(reading.encoding)
 
 
 def _linear(path: Path, stored: StoredImage, reading: ImageReading, what: str) -> Float32:

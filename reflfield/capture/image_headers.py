@@ -31,9 +31,12 @@ MAX_PIXELS = 160_000_000
 # have more, a single colour that compresses to nothing has not.
 PIXELS_UNASKED = 1 << 24
 PIXELS_PER_BYTE = 64
+# Data of an EXR beyond what its display window shows are read in vain.
+MOST_OVERSCAN = 4
 MOST_PNG_CHUNKS = 10_000
 # Chunks of a PNG whose content is read here, and how much of it.
-PNG_CHUNKS = {b"IHDR": 13, b"gAMA": 4, b"cHRM": 32, b"sRGB": 1, b"cICP": 4, b"eXIf": 1 << 16}
+PNG_CHUNKS = {b"IHDR": 13, b"gAMA": 4, b"cHRM": 32, b"sRGB": 1, b"cICP": 4, b"eXIf": 1 << 16,
+              b"iCCP": 1 << 23}  # fmt: skip
 MOST_JPEG_SEGMENTS = 10_000
 LARGEST_RADIANCE_HEADER = 1 << 16
 
@@ -207,8 +210,19 @@ def _exr(path: Path, file: IO[bytes]) -> ImageHeader:
     for part in parts:
         check_size(path, *part.data_window.size, n_bytes)
         check_size(path, *part.display_window.size, MAX_PIXELS)
+        _check_overscan(path, part)
     width, height = parts[0].display_window.size
     return ImageHeader("exr", width, height, parts=parts)
+
+
+def _check_overscan(path: Path, part: ExrPart) -> None:
+    """Demand data that are not far larger than what is shown of them."""
+    data, shown = (w * h for w, h in (part.data_window.size, part.display_window.size))
+    if data > max(PIXELS_UNASKED, MOST_OVERSCAN * shown):
+        raise CaptureError(
+            f"{path}: expected a data window of at most {MOST_OVERSCAN} times the display "
+            f"window, received {data:,} pixels for {shown:,}; crop it"
+        )
 
 
 def _tiff(path: Path, file: IO[bytes]) -> ImageHeader:
@@ -278,4 +292,10 @@ def _hdr(path: Path, file: IO[bytes]) -> ImageHeader:
             f"(-Y height +X width), received {size[:40]!r}; convert it"
         )
     lines = tuple(line.strip() for line in head.split("\n")[1:])
+    formats = {line.partition("=")[2].strip() for line in lines if line.startswith("FORMAT=")}
+    if formats != {"32-bit_rle_rgbe"}:
+        raise CaptureError(
+            f"{path}: expected a Radiance image of FORMAT 32-bit_rle_rgbe, received "
+            f"{', '.join(sorted(formats))[:40] or 'no FORMAT'}; convert it"
+        )
     return ImageHeader("hdr", int(numbers[2]), int(numbers[1]), lines=lines)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from functools import lru_cache
 from pathlib import Path
 
 from reflfield.capture.color_spaces import (
     ADOBE_GAMMA,
     ADOBE_RGB,
+    LARGEST_PROFILE,
     P3_D65,
     REC709,
     REC2020,
@@ -50,7 +52,7 @@ def stated_space(
     part : int
         Part or page that is read.
     profile : bytes
-        The file's ICC profile, or nothing.
+        The ICC profile of a JPEG or TIFF, or nothing.
     adobe_rgb : bool
         Whether Exif data say Adobe RGB, as cameras write it without a profile.
     is_float : bool
@@ -71,7 +73,7 @@ def stated_space(
         if header.kind == "hdr":
             return _radiance_space(header.lines)
         if header.kind == "png":
-            return _png_space(header.chunks, profile)
+            return _png_space(header.chunks)
         if profile:
             return _profile_space(profile)
         if adobe_rgb:
@@ -111,14 +113,12 @@ def _profile_space(profile: bytes) -> ColorSpace:
     return space_of_profile(profile)
 
 
-def _png_space(chunks: dict[bytes, bytes], profile: bytes) -> ColorSpace:
+def _png_space(chunks: dict[bytes, bytes]) -> ColorSpace:
     """What comes first in the order of PNG (third edition): cICP, iCCP, sRGB, gAMA, cHRM."""
     if b"cICP" in chunks:
         return _cicp_space(chunks[b"cICP"])
     if b"iCCP" in chunks:
-        if not profile:
-            raise InputError("an ICC profile that is damaged")
-        return _profile_space(profile)
+        return _profile_space(_png_profile(chunks[b"iCCP"]))
     if b"sRGB" in chunks:
         return ColorSpace(Encoding(SRGB))
     encoding = Encoding(SRGB)
@@ -130,6 +130,15 @@ def _png_space(chunks: dict[bytes, bytes], profile: bytes) -> ColorSpace:
         white_first = [n / 100_000 for n in struct.unpack(">8I", chunks[b"cHRM"])]
         matrix = rec709_from_primaries((*white_first[2:], *white_first[:2]))
     return ColorSpace(encoding, matrix)
+
+
+def _png_profile(content: bytes) -> bytes:
+    """The profile in an iCCP chunk: a name, a zero, the method 0, and the packed profile."""
+    packed = content[content.find(b"\0") + 2 :]
+    try:
+        return zlib.decompressobj().decompress(packed, LARGEST_PROFILE)
+    except zlib.error as error:
+        raise InputError("an ICC profile that is damaged") from error
 
 
 def _power(gamma: float) -> Encoding:
@@ -152,8 +161,6 @@ def _cicp_space(content: bytes) -> ColorSpace:
 
 def _radiance_space(lines: tuple[str, ...]) -> ColorSpace:
     values = dict(line.partition("=")[::2] for line in lines if "=" in line)
-    if values.get("FORMAT", "32-bit_rle_rgbe").strip() != "32-bit_rle_rgbe":
-        raise InputError(f"a Radiance file of FORMAT {values['FORMAT'][:40]!r}")
     if abs(_number(values.get("GAMMA", "1")) - 1) > 1e-3:
         raise InputError(f"a Radiance file of GAMMA {values['GAMMA'][:40]!r}")
     words = values.get("PRIMARIES", "").split()
