@@ -41,14 +41,22 @@ def check_pairs(capture: Capture) -> None:
         seen[pair] = photograph.name
 
 
-def check_lights_shine(capture: Capture) -> None:
-    """Demand that every light with a photograph gives light.
+def check_lights(capture: Capture) -> None:
+    """Demand that lights with photographs give light, and are all known or all unknown.
 
     Raises
     ------
     CaptureError
-        Naming the first light that does not, and one of its photographs.
+        Naming the first light that is not so, and one of its photographs.
     """
+    for photograph in capture.photographs:
+        if not capture.lights[photograph.light].known and capture.lights_known_in_part:
+            raise CaptureError(
+                f"{capture.description}: light {capture.lights[photograph.light].id!r} of "
+                f"photograph {photograph.name!r}: expected a known light as others are, "
+                "received one of type 'unknown'; measure it, leave out its photographs, or "
+                "make all lights unknown"
+            )
     dark = [not light.shines for light in capture.lights]
     for photograph in capture.photographs:
         if dark[photograph.light]:

@@ -184,6 +184,11 @@ class Capture:
         return all(light.kind != UNKNOWN for light in self.lights)
 
     @property
+    def lights_known_in_part(self) -> bool:
+        """Whether some lights were measured and others not."""
+        return len({light.known for light in self.lights}) > 1
+
+    @property
     def test_split(self) -> NDArray[np.intp]:
         """Indices of the photographs that the capture's maker keeps for comparison."""
         return np.flatnonzero([photograph.is_test for photograph in self.photographs])

@@ -11,7 +11,7 @@ from pathlib import Path
 from reflfield.capture import lp, middlebury, native, transforms_json
 from reflfield.capture.consistency import (
     check_environments,
-    check_lights_shine,
+    check_lights,
     check_pairs,
     check_photographs,
     unphotographed,
@@ -98,7 +98,7 @@ def open_capture(
     check_environments(capture)
     if require_photographs:
         check_pairs(capture)
-        check_lights_shine(capture)
+        check_lights(capture)
         check_poses(capture.cameras, capture.description)
         check_photographs(capture)
         capture = replace(capture, notes=(*capture.notes, *unphotographed(capture)))

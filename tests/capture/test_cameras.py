@@ -11,6 +11,7 @@ from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.lenses import distort, largest_radius, undistort
 from reflfield.errors import CaptureError, ShapeError
 
+FISHEYE = (0.05, -0.01, 0.0, 0.0, 0.003, 0.001)
 BARREL = (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02)
 
 
@@ -91,17 +92,62 @@ class TestExact:
         assert inside.tolist() == [True, True, False, False]
 
 
+class TestFisheye:
+    def test_equidistant_by_hand(self):
+        # 45 degrees off the axis in x: f pi/4 from the middle
+        pixels, depth = make_camera("opencv_fisheye").project([[1.0, 0.0, 1.0]])
+        np.testing.assert_allclose(pixels, [[31 + 70 * np.pi / 4, 25]], rtol=1e-15)
+        assert depth.tolist() == [1]
+
+    def test_rays_by_hand(self):
+        # 70 pi/3 pixels beside the middle: 60 degrees off the axis
+        _, directions = make_camera("opencv_fisheye").rays([[31 + 70 * np.pi / 3, 25]])
+        np.testing.assert_allclose(directions, [[3**0.5 / 2, 0, 0.5]], atol=1e-14)
+
+    def test_steep_rays_and_those_beyond_90_degrees(self):
+        camera = make_camera("opencv_fisheye")
+        radii = 70 * np.radians([0.0, 89.9, 90.1, 170.0])
+        pixels = np.stack([31 + radii, np.full(4, 25.0)], axis=1)
+        _, directions = camera.rays(pixels)
+        angles = np.degrees(np.arccos(directions[:2, 2]))
+        np.testing.assert_allclose(angles, [0, 89.9], atol=1e-5)
+        assert np.isnan(directions[2:]).all()
+        assert np.isnan(camera.project([[1.0, 0, 0], [1, 0, -1]])[0]).all()
+
+    def test_behind_the_fold_there_is_no_image(self):
+        # theta - theta^3/3 folds at theta = 1
+        camera = make_camera("opencv_fisheye", (-1 / 3, 0, 0, 0, 0, 0))
+        pixels, _ = camera.project([[np.tan(0.99), 0, 1], [np.tan(1.01), 0, 1]])
+        assert pixels[0, 0] == pytest.approx(31 + 70 * (0.99 - 0.99**3 / 3), rel=1e-14)
+        assert np.isnan(pixels[1]).all()
+        _, directions = camera.rays([pixels[0], [31 + 70 * 0.67, 25]])
+        assert directions[0, 2] == pytest.approx(np.cos(0.99), abs=1e-7)
+        assert np.isnan(directions[1]).all()
+
+    def test_lines_bend(self):
+        assert not make_camera("opencv_fisheye").keeps_lines_straight
+        assert make_camera().keeps_lines_straight
+        assert not make_camera(distortion=BARREL).keeps_lines_straight
+
+    def test_no_points(self):
+        camera = make_camera("opencv_fisheye")
+        assert camera.project(np.zeros((0, 3)))[0].shape == (0, 2)
+        assert camera.rays(np.zeros((0, 2)))[1].shape == (0, 3)
+
+
 class TestLaws:
-    @pytest.mark.parametrize("kind", ["opencv", "orthographic"])
+    @pytest.mark.parametrize("kind", ["opencv", "opencv_fisheye", "orthographic"])
     @pytest.mark.parametrize("distortion", [(0.0,) * 6, BARREL])
     def test_points_on_rays_project_back(self, rng, rounding, kind, distortion):
+        if kind == "opencv_fisheye" and any(distortion):
+            distortion = FISHEYE
         camera = make_camera(kind, distortion, random_pose(rng))
         points, pixels = points_in_front(camera, rng)
         back, depth = camera.project(points)
         # pixels are ~64, the inverse lens stops at Newton's tolerance of 1e-9 focal lengths
         tolerance = rounding(np.float64, operations=50, scale=64) + 70 * 1e-9 * any(distortion)
         np.testing.assert_allclose(back, pixels, rtol=0, atol=tolerance)
-        if kind == "opencv":
+        if kind != "orthographic":
             assert (depth > 0).all()
 
     def test_view_directions_oppose_rays(self, rng, rounding):
@@ -141,14 +187,22 @@ class TestLaws:
 
 @pytest.mark.reference
 class TestOpenCV:
-    @pytest.mark.parametrize("distortion", [(0.0,) * 6, BARREL, (0.3, -0.1, 0, 0.01, 0.02, 0)])
+    @pytest.mark.parametrize(
+        "distortion",
+        [
+            (0.0,) * 6,
+            BARREL,
+            (0.3, -0.1, 0, 0.01, 0.02, 0),
+            (0.1, -0.05, 0.01, -0.02, 0.01, 0.2, -0.01, 0.005),
+        ],
+    )
     def test_projection(self, rng, rounding, distortion):
         camera = make_camera(distortion=distortion, pose=random_pose(rng))
         points, _ = points_in_front(camera, rng)
         pose = camera.camera_from_world
         turned, _ = cv2.Rodrigues(pose[:3, :3])
         expected, _ = cv2.projectPoints(
-            points, turned, pose[:3, 3], camera.matrix, np.array([*distortion, 0.0, 0.0])
+            points, turned, pose[:3, 3], camera.matrix, np.array(camera.distortion)
         )
         pixels, _ = camera.project(points)
         # Rodrigues' round trip costs a few hundred roundings
