@@ -14,7 +14,7 @@ import stat
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -97,7 +97,10 @@ def read_bytes(path: Path, most_bytes: int, error: type[InputError] = InputError
 
 
 def load_arrays(
-    path: Path, most_bytes: int, error: type[InputError] = InputError
+    path: Path,
+    most_bytes: int,
+    error: type[InputError] = InputError,
+    names: Collection[str] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Arrays of an npz file, whose sizes are looked at before memory is taken.
 
@@ -105,9 +108,11 @@ def load_arrays(
     ----------
     path : Path
     most_bytes : int
-        Of all arrays together, unpacked.
+        Of all arrays together that are read, unpacked.
     error : type, optional
         What to raise.
+    names : collection of str, optional
+        Arrays to read, which must be there; None reads all.
 
     Returns
     -------
@@ -123,7 +128,7 @@ def load_arrays(
     check_regular(path, error)
     try:
         with zipfile.ZipFile(path) as archive:
-            members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+            members = _members(archive, names)
             size = sum(member.file_size for member in members)
             if size > most_bytes:
                 raise error(
@@ -145,6 +150,17 @@ def load_arrays(
             f"{path}: expected arrays in an npz file, received a damaged, truncated or "
             f"different file ({text}); copy or make it again"
         ) from failure
+
+
+def _members(archive: zipfile.ZipFile, names: Collection[str] | None) -> list[zipfile.ZipInfo]:
+    """The arrays of some names, or all."""
+    members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+    if names is None:
+        return members
+    present = {member.filename.removesuffix(".npy") for member in members}
+    if missing := sorted(set(names) - present):
+        raise ValueError(f"without {', '.join(missing)}")
+    return [m for m in members if m.filename.removesuffix(".npy") in names]
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:

@@ -25,6 +25,7 @@ GIVEN, ALPHA, PHOTOGRAPHS, HULL, IMAGE = "given", "alpha", "photographs", "hull"
 LEAST_PHOTOGRAPHS = 4
 ORIGINS = "origins.json"
 ROWS_AT_ONCE = 256
+HEADER_BYTES = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,8 @@ class FrameSilhouettes:
     def read(self, view: int) -> Float32:
         """Coverage of a view in [0, 1], (h, w) float32, in steps of 1/255."""
         camera = self.cameras[view]
-        stored = load_arrays(_file(self.folder, view), 2 * camera.width * camera.height)
+        most = camera.width * camera.height + HEADER_BYTES
+        stored = load_arrays(_file(self.folder, view), most)
         return stored["coverage"].astype(np.float32) / np.float32(255)
 
 

@@ -12,7 +12,6 @@ Pictures against true pictures are `reflfield.comparison.metrics.compare_frames`
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,13 +23,33 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from reflfield.capture.documents import read_json
 from reflfield.checks import check_shape
 from reflfield.errors import CaptureError, InputError, ShapeError
+from reflfield.files import check_regular, load_arrays
 from reflfield.geometry.open3d_library import open3d
 
 Array = NDArray[np.float64]
 
 TRUTH_VERSION = 1
+# A file that takes more memory is not read.
+MOST_BYTES = 2 << 30
+# Arrays of the files, and the lengths of their axes; one name is one length within a file.
+VIEW_SHAPES = {
+    "depth": "h w",
+    "position": "h w 3",
+    "normal": "h w 3",
+    "tangent": "h w 3",
+    "label": "h w",
+}
+SAMPLE_SHAPES = {
+    "position": "n 3",
+    "frame": "n 3 3",
+    "views": "n views 3",
+    "lights": "n lights 3",
+    "light_visible": "n lights",
+    "samples": "n views lights 3",
+}
 # Enough for percentiles to one part in a hundred; a second of work.
 HULL_SAMPLES = 20_000
 # Frames between surface points: a line through that many, of one material and
@@ -84,17 +103,31 @@ class Truth:
     def mesh(self) -> tuple[Array, NDArray[np.int32]]:
         """Vertices (n, 3), metres, and faces (m, 3) of the true surface."""
         path = self.path("mesh", "truth/mesh.ply")
-        loaded = trimesh.load(_existing(path), process=False, force="mesh")
-        return np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int32)
+        if check_regular(path, CaptureError) > MOST_BYTES:
+            raise CaptureError(f"{path}: expected a mesh of at most {MOST_BYTES:,} bytes")
+        try:
+            loaded = trimesh.load(path, process=False, force="mesh")
+            vertices = np.array(loaded.vertices, np.float64).reshape(-1, 3)
+            faces = np.array(loaded.faces, np.int32).reshape(-1, 3)
+        except Exception as error:  # whatever its readers raise on damaged files
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise CaptureError(
+                f"{path}: expected a mesh, received a damaged or different file ({text})"
+            ) from error
+        inside = ((faces >= 0) & (faces < len(vertices))).all()
+        if not len(faces) or not inside or not np.isfinite(vertices).all():
+            raise CaptureError(
+                f"{path}: expected a mesh of faces between finite vertices, received "
+                f"{len(vertices)} vertices and {len(faces)} faces that are not"
+            )
+        return vertices, faces
 
     def view(self, camera_id: str) -> TruthView:
         """What the camera of this name truly sees."""
-        path = self._view_path(camera_id)
-        with np.load(_existing(path), allow_pickle=False) as arrays:
-            missing = [n for n in TruthView.__annotations__ if n not in arrays]
-            if missing:
-                raise CaptureError(f"{path}: expected arrays {', '.join(missing)}, found none")
-            return TruthView(**{n: arrays[n] for n in TruthView.__annotations__})
+        path, names = self._view_path(camera_id), TruthView.__annotations__
+        arrays = load_arrays(path, MOST_BYTES, CaptureError, names)
+        _check_arrays(path, arrays, VIEW_SHAPES)
+        return TruthView(**{name: arrays[name] for name in names})
 
     def has_view(self, camera_id: str) -> bool:
         """Whether the truth of this camera's pixels was written."""
@@ -103,15 +136,22 @@ class Truth:
     def heldout(self) -> Path | None:
         """The frames file of unseen views and lights, if there is one."""
         path = self.path("heldout", "truth/heldout.json")
-        return path if path.is_file() else None
+        return path if path.exists() else None
 
     def samples(self) -> dict[str, NDArray[Any]] | None:
-        """True apparent BRDFs of some surface points (``abrdf.npz``), if written."""
+        """True apparent BRDFs of some surface points (``abrdf.npz``), if written.
+
+        See `SAMPLE_SHAPES`. Positions and directions are finite; samples may be NaN.
+        """
         path = self.path("abrdf", "truth/abrdf.npz")
-        if not path.is_file():
+        if not path.exists():
             return None
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays}
+        arrays = load_arrays(path, MOST_BYTES, CaptureError, SAMPLE_SHAPES)
+        _check_arrays(path, arrays, SAMPLE_SHAPES)
+        for name in ("position", "views", "lights", "frame"):
+            if not np.isfinite(arrays[name]).all():
+                raise CaptureError(f"{path}: {name}: expected finite numbers")
+        return arrays
 
     def path(self, key: str, default: str) -> Path:
         """File that ``truth.json`` names under a key, inside the capture."""
@@ -142,13 +182,10 @@ def open_truth(root: Path | str) -> Truth | None:
         If the file is not valid or of a newer version.
     """
     path = Path(root) / "truth" / "truth.json"
-    if not path.is_file():
+    if not path.exists():
         return None
-    try:
-        description = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise CaptureError(f"{path}: expected JSON, received {error}") from error
-    version = description.get("version") if isinstance(description, dict) else None
+    description = read_json(path)
+    version = description.get("version")
     if version != TRUTH_VERSION:
         raise CaptureError(
             f"{path}: expected version {TRUTH_VERSION}, received {version!r}; simulate again "
@@ -580,10 +617,22 @@ def _inside(root: Path, relative: str) -> Path:
     return path
 
 
-def _existing(path: Path) -> Path:
-    if not path.is_file():
-        raise CaptureError(f"{path}: expected a file of the capture's truth, found none")
-    return path
+def _check_arrays(
+    path: Path, arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, str]
+) -> None:
+    """Demand numbers, and axes of one name to be of one length in all arrays."""
+    lengths: dict[str, int] = {}
+    for name, axes in shapes.items():
+        array, expected = arrays[name], axes.split()
+        fits = array.ndim == len(expected) and array.dtype.kind in "biuf"
+        if not fits or any(
+            lengths.setdefault(axis, int(axis) if axis.isdigit() else length) != length
+            for axis, length in zip(expected, array.shape, strict=True)
+        ):
+            raise CaptureError(
+                f"{path}: {name}: expected numbers of shape ({', '.join(expected)}), received "
+                f"{array.dtype} of shape {array.shape}"
+            )
 
 
 def _checked_mesh(

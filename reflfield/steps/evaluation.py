@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,49 @@ def read_comparison(path: Path) -> Comparison | None:
 # --- truth of simulated captures ----------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class TruthScores:
+    """Scores against the truth of a simulated capture; None where there is none.
+
+    Parameters
+    ----------
+    hull : HullDistance, optional
+    frames, base_frames : FrameErrors, optional
+    completion : CompletionError, optional
+    problems : tuple of str
+        Files of the truth that could not be used, and why.
+    """
+
+    hull: HullDistance | None = None
+    frames: FrameErrors | None = None
+    base_frames: FrameErrors | None = None
+    completion: CompletionError | None = None
+    problems: tuple[str, ...] = ()
+
+
+def truth_scores(job: Job, field: ReflectanceField) -> TruthScores | None:
+    """All scores against the truth; without what of it is damaged. None without a truth."""
+    try:
+        truth = open_truth(job.capture.root)
+    except InputError as error:
+        return TruthScores(problems=(f"truth: not compared: {error}",))
+    if truth is None:
+        return None
+    problems: list[str] = []
+
+    def score(of: Callable[[], Any]) -> Any:
+        try:
+            return of()
+        except InputError as error:
+            problems.append(f"truth: not compared: {error}")
+            return None
+
+    hull = None if job.is_plane else score(lambda: hull_score(job, truth))
+    frames, base = score(lambda: frame_scores(job, truth, field)) or (None, None)
+    completion = score(lambda: completion_score(job, truth))
+    return TruthScores(hull, frames, base, completion, tuple(problems))
+
+
 def hull_score(job: Job, truth: Truth) -> HullDistance:
     """Distance of the hull to the true surface, also in voxels of the hull's grid."""
     details = json.loads((job.stages.root / "hull" / "hull.json").read_text())
@@ -237,6 +281,12 @@ def completion_score(job: Job, truth: Truth) -> CompletionError | None:
     points = truth.samples()
     if points is None or not job.training.lights_known:
         return None
+    counts, expected = points["samples"].shape[1:3], (job.capture.n_views, job.capture.n_lights)
+    if counts != expected:
+        raise InputError(
+            f"{truth.path('abrdf', '')}: samples: expected the capture's {expected[0]} views "
+            f"and {expected[1]} lights, received {counts[0]} and {counts[1]}"
+        )
     return _completion_at(job, points)
 
 

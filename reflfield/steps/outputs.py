@@ -18,7 +18,6 @@ from reflfield.comparison.heldout import RelitPairs, mean_sample
 from reflfield.comparison.metrics import Comparison
 from reflfield.comparison.pictures import texture
 from reflfield.comparison.report import ReportContent, Section, write_report
-from reflfield.comparison.truth import open_truth
 from reflfield.export.gltf import write_glb
 from reflfield.field.file import describe, open_field
 from reflfield.field.model import ReflectanceField
@@ -54,9 +53,11 @@ def write_maps(job: Job, folder: Path) -> dict[str, Any]:
 def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
     """The page: everything that was found."""
     field = open_field(job.stages.root / "compression" / "field.rfld")
-    content = report_content(job, field, job.result("maps", AVERAGES)["average"])
+    scores = evaluation.truth_scores(job, field)
+    content = report_content(job, field, job.result("maps", AVERAGES)["average"], scores)
     write_report(folder / "index.html", content)
-    return {"sections": len(content.sections)}
+    problems = scores.problems if scores is not None else ()
+    return {"sections": len(content.sections), evaluation.PROBLEMS: list(problems)}
 
 
 def _write_maps(job: Job, field: ReflectanceField, folder: Path) -> None:
@@ -121,7 +122,10 @@ def _write_mesh(job: Job, average: NDArray[np.float32], folder: Path) -> None:
 
 
 def report_content(
-    job: Job, field: ReflectanceField, average: NDArray[np.float32]
+    job: Job,
+    field: ReflectanceField,
+    average: NDArray[np.float32],
+    scores: evaluation.TruthScores | None,
 ) -> ReportContent:
     """All sections of the page, in the order of the stages."""
     compared = {
@@ -135,7 +139,7 @@ def report_content(
         *_rate_sections(job),
         *_surface_sections(job, field, average),
         _alignment_section(job),
-        *_truth_sections(job, field, compared.get("truth")),
+        *_truth_sections(scores, compared.get("truth")),
         _compression_section(job),
         sections.accounts_section(list(accounts_of(job))),
         sections.stages_section([_stage(record) for record in job.stages.records]),
@@ -153,7 +157,9 @@ def report_content(
             seconds=choices.total_seconds(job),
         ),
         sections=tuple(parts),
-        warnings=tuple(warnings_of(job)),
+        warnings=tuple(
+            dict.fromkeys((*warnings_of(job), *(scores.problems if scores else ())))
+        ),
         footer="" if counts is None else f"Stages in {job.stages.root.name}/",
     )
 
@@ -173,9 +179,10 @@ def raw_bytes(job: Job) -> int:
 
 
 def problems_of(job: Job) -> Iterator[str]:
-    """What could not be compared, and why."""
-    for record in job.stages.records:
-        yield from record.counts.get(evaluation.PROBLEMS, ())
+    """What could not be compared, and why; each once."""
+    records = job.stages.records
+    found = (text for r in records for text in r.counts.get(evaluation.PROBLEMS, ()))
+    yield from dict.fromkeys(found)
 
 
 def warnings_of(job: Job) -> Iterator[str]:
@@ -332,19 +339,16 @@ def _alignment_section(job: Job) -> Section:
 
 
 def _truth_sections(
-    job: Job, field: ReflectanceField, compared: Comparison | None
+    scores: evaluation.TruthScores | None, compared: Comparison | None
 ) -> Iterator[Section]:
-    truth = open_truth(job.capture.root)
-    if truth is None:
-        return
-    frames = evaluation.frame_scores(job, truth, field)
-    yield sections.truth_section(
-        hull=None if job.is_plane else evaluation.hull_score(job, truth),
-        frames=frames[0] if frames else None,
-        base_frames=frames[1] if frames else None,
-        completion=evaluation.completion_score(job, truth),
-        comparison=compared,
-    )
+    if scores is not None:
+        yield sections.truth_section(
+            hull=scores.hull,
+            frames=scores.frames,
+            base_frames=scores.base_frames,
+            completion=scores.completion,
+            comparison=compared,
+        )
 
 
 def _compression_section(job: Job) -> Section:

@@ -343,8 +343,68 @@ def test_truth_that_lies_is_refused(capture):
     with pytest.raises(CaptureError, match="version 1, received 2"):
         open_truth(capture)
     (capture / "truth" / "truth.json").write_text("[1]")
-    with pytest.raises(CaptureError, match="version"):
+    with pytest.raises(CaptureError, match="object, received list"):
         open_truth(capture)
     (capture / "truth" / "truth.json").write_text("{")
     with pytest.raises(CaptureError, match="JSON"):
         open_truth(capture)
+
+
+VIEW = "v000.npz"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda a: a.pop("normal"), r"v000\.npz.*without normal"),
+        (lambda a: a.update(depth=np.zeros((4, 6))), r"position: expected .*\(4, 5, 3\)"),
+        (lambda a: a.update(position=np.zeros((4, 5, 2))), r"position.*\(4, 5, 2\)"),
+        (lambda a: a.update(label=np.array([["a"] * 5] * 4)), "label: expected numbers"),
+        (lambda a: a.update(tangent=np.array([{}], dtype=object)), "pickled objects"),
+    ],
+)
+def test_a_view_that_does_not_hold_together_is_refused(capture, spoil, words):
+    arrays = dict(vars(small_view()))
+    spoil(arrays)
+    np.savez(capture / "truth" / "views" / VIEW, **arrays)
+    with pytest.raises(CaptureError, match=words):
+        open_truth(capture).view("v000")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda a: a["views"].fill(np.nan), "views: expected finite numbers"),
+        (lambda a: a["position"].fill(np.inf), "position: expected finite numbers"),
+        (lambda a: a.pop("samples"), "without samples"),
+        (lambda a: a.update(lights=np.ones((7, 3, 3))), r"light_visible: .*\(7, 2\)"),
+    ],
+)
+def test_samples_that_do_not_hold_together_are_refused(capture, spoil, words):
+    shapes = {"position": (7, 3), "frame": (7, 3, 3), "views": (7, 4, 3), "lights": (7, 2, 3)}
+    arrays = {name: np.ones(shape) for name, shape in shapes.items()}
+    arrays |= {"light_visible": np.ones((7, 2), bool), "samples": np.ones((7, 4, 2, 3))}
+    np.savez(capture / "truth" / "abrdf.npz", **arrays)
+    # Samples that are not known may be NaN; they are left out of the score.
+    assert open_truth(capture).samples()["samples"].shape == (7, 4, 2, 3)
+    spoil(arrays)
+    np.savez(capture / "truth" / "abrdf.npz", **arrays)
+    with pytest.raises(CaptureError, match=words):
+        open_truth(capture).samples()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"ply\nformat ascii 1.0\nelement vertex 9\n",
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        b"property float z\nelement face 1\nproperty list uchar int vertex_indices\n"
+        b"end_header\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n",
+        b"",
+    ],
+    ids=["cut off", "nan", "empty"],
+)
+def test_a_mesh_that_is_none_is_refused(capture, text):
+    (capture / "truth" / "mesh.ply").write_bytes(text)
+    with pytest.raises(CaptureError, match=r"mesh\.ply: expected a mesh"):
+        open_truth(capture).mesh()
