@@ -16,7 +16,6 @@ import hashlib
 import io
 import json
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -38,6 +37,13 @@ from reflfield.field.model import (
     node_side,
 )
 from reflfield.field.packing import FILTERS, pack, unpack
+from reflfield.field.stored_values import (
+    LONGEST_AXIS,
+    check_lengths,
+    check_stored,
+    memory_needed,
+)
+from reflfield.files import check_regular, replacing
 
 FORMAT_NAME = "reflfield-field"
 FORMAT_VERSION = 3
@@ -46,9 +52,9 @@ OLDEST_VERSION = 3
 HEADER = "header.json"
 MAX_HEADER_BYTES = 16 << 20
 
-# More than the largest field that the evaluation could hold decoded; a file that
-# declares more is damaged or hostile. `open_field` takes another limit.
-MAX_BYTES = 8 << 30
+# Ten times what a large field takes while it is decoded (21 x 21 nodes for each direction, 16
+# clusters of 10 components); `open_field` takes another limit.
+MAX_BYTES = 4 << 30
 
 # The oldest date a ZIP archive can hold.
 FIXED_TIME = (1980, 1, 1, 0, 0, 0)
@@ -76,7 +82,7 @@ def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
     OSError
         If the target cannot be written.
     """
-    with _replacing(Path(path)) as file:
+    with replacing(Path(path)) as partial, partial.open("w+b") as file:
         members = {n: packed_array(n, reflectance_field.arrays[n]) for n in ARRAYS}
         _write_archive(file, reflectance_field, members)
 
@@ -123,7 +129,8 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
     path : Path or str
         A file that `write_field` made.
     max_bytes : int
-        Refuse a file whose arrays would take more memory than this.
+        Refuse a field that would take more memory than this while it is read and decoded,
+        by estimate.
 
     Returns
     -------
@@ -132,9 +139,9 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
     Raises
     ------
     FieldFileError
-        If the file is missing, not a field, damaged, of a newer version, or
-        declares sizes that its bytes do not bear out. A damaged array raises
-        when it is first used.
+        If the file is missing, not a regular one, not a field, damaged, of a newer version,
+        or declares sizes that its bytes do not bear out. A damaged array, or one with values
+        that no field has, raises when it is first used.
     """
     path = Path(path)
     with _archive(path) as archive:
@@ -145,20 +152,15 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
             infos[member_name(name)].compress_type != zipfile.ZIP_STORED for name in declared
         ):
             raise FieldFileError(f"{path}: expected stored members, received packed ones")
-    # The functions of the clusters are held decoded.
-    decoded = (
-        declared["function_gain"].n_bytes
-        * 3
-        * prod(declared[f"{which}_factor"].shape[0] for which in ("view", "light"))
-    )
-    total = decoded + sum(array.n_bytes for array in declared.values())
+    shapes = {name: array.shape for name, array in declared.items()}
+    total = memory_needed(shapes, {name: array.n_bytes for name, array in declared.items()})
     if total > max_bytes:
         raise FieldFileError(
             f"{path}: expected arrays of at most {max_bytes} bytes, the header declares "
-            f"{total}; pass a larger max_bytes if the file is to be trusted"
+            f"some that take {total:.0f}; pass a larger max_bytes if the file is to be trusted"
         )
     with _naming(path):
-        return _field(header, declared, StoredArrays(path, declared))
+        return _field(header, StoredArrays(path, declared))
 
 
 @dataclass(frozen=True)
@@ -195,7 +197,13 @@ class StoredArrays(Mapping[str, NDArray[Any]]):
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name not in self._read:
-            self._read[name] = _read_array(self.path, name, self.declared[name])
+            array = _read_array(self.path, name, self.declared[name])
+            try:
+                shapes = {other: declared.shape for other, declared in self.declared.items()}
+                check_stored(name, array, shapes)
+            except InputError as error:
+                raise FieldFileError(f"{self.path}: {error}") from error
+            self._read[name] = array
         return self._read[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -278,30 +286,14 @@ def _add(
 
 
 @contextmanager
-def _replacing(target: Path) -> Iterator[io.BufferedRandom]:
-    """Yield a new file beside the target; take its place on success, vanish on failure."""
-    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    temporary = Path(name)
-    try:
-        with os.fdopen(descriptor, "w+b") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-@contextmanager
 def _naming(path: Path) -> Iterator[None]:
     """Turn whatever the readers raise into an error that names the file."""
     try:
         yield
     except FieldFileError:
         raise
-    except FileNotFoundError as error:
-        raise FieldFileError(f"{path}: no such file") from error
+    except (FileNotFoundError, PermissionError) as error:
+        raise FieldFileError(f"{path}: cannot be read ({error.strerror})") from error
     except zipfile.BadZipFile as error:
         raise FieldFileError(
             f"{path}: expected a reflectance field (a ZIP archive), received another or a "
@@ -309,6 +301,8 @@ def _naming(path: Path) -> Iterator[None]:
         ) from error
     except (
         OSError,
+        MemoryError,
+        OverflowError,
         EOFError,
         ValueError,
         KeyError,
@@ -325,6 +319,9 @@ def _naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    if not os.path.lexists(path):
+        raise FieldFileError(f"{path}: no such file")
+    check_regular(path, FieldFileError)
     with _naming(path), zipfile.ZipFile(path) as archive:
         yield archive
 
@@ -354,12 +351,12 @@ def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
         raise FieldFileError(
             f"{path}: {HEADER}: expected at most {MAX_HEADER_BYTES} bytes, received {size}"
         )
-    header = json.loads(archive.read(HEADER))
+    header = json.loads(archive.read(HEADER), parse_constant=_no_number)
     if not isinstance(header, dict) or header.get("format") != FORMAT_NAME:
         raise FieldFileError(f"{path}: {HEADER}: expected format {FORMAT_NAME!r}")
     version = header.get("version")
-    if not isinstance(version, int) or version < 1:
-        raise FieldFileError(f"{path}: version: expected a number, received {version!r}")
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise FieldFileError(f"{path}: version: expected a number, received {version!r:.100}")
     if version > FORMAT_VERSION:
         raise FieldFileError(
             f"{path}: written in version {version} of the format, this program reads up to "
@@ -386,7 +383,7 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
             )
             for name, entry in header["arrays"].items()
         }
-        check_arrays({name: (a.dtype, a.shape) for name, a in declared.items()})
+        check_lengths(check_arrays({n: (a.dtype, a.shape) for n, a in declared.items()}))
         for name, array in declared.items():
             if array.filter not in FILTERS:
                 raise ValueError(f"{name}: unknown filter {array.filter!r}")
@@ -395,9 +392,16 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
 
 
 def _length(value: Any) -> int:
-    if not isinstance(value, int) or value < 0:
-        raise ValueError(f"shape: expected numbers >= 0, received {value!r}")
-    return value
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if not whole or not 0 <= value <= LONGEST_AXIS:
+        raise ValueError(
+            f"shape: expected numbers >= 0, at most {LONGEST_AXIS}, received {value!r:.100}"
+        )
+    return int(value)
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"expected finite numbers, received {name}")
 
 
 def _read_array(path: Path, name: str, declared: DeclaredArray) -> NDArray[Any]:
@@ -422,21 +426,25 @@ def _read_array(path: Path, name: str, declared: DeclaredArray) -> NDArray[Any]:
     return array
 
 
-def _field(
-    header: Mapping[str, Any], declared: Mapping[str, DeclaredArray], arrays: StoredArrays
-) -> ReflectanceField:
+def _field(header: Mapping[str, Any], arrays: StoredArrays) -> ReflectanceField:
     n_view_nodes, n_light_nodes = (
-        declared[f"{which}_factor"].shape[0] for which in ("view", "light")
+        arrays.declared[f"{which}_factor"].shape[0] for which in ("view", "light")
     )
-    return ReflectanceField(
+    metadata = header["metadata"]
+    if not isinstance(metadata, dict):
+        raise ValueError(f"metadata: expected a table, received {metadata!r:.100}")
+    opened = ReflectanceField(
         arrays=arrays,
         view_side=node_side("view_factor", n_view_nodes),
         light_side=node_side("light_factor", n_light_nodes),
         domain=header["domain"],
         visibility=header["visibility"],
         light_model=header["light_model"],
-        metadata=dict(header["metadata"]),
+        metadata=metadata,
     )
+    # What the metadata say of directions is used much later.
+    _ = opened.up, opened.observed_lights
+    return opened
 
 
 @dataclass(frozen=True)

@@ -173,8 +173,9 @@ class ReflectanceField:
             check_finite(f"{name}_scale", self.arrays[f"{name}_scale"])
         check_finite("function_gain", self.arrays["function_gain"])
         check_finite("colour_factor", self.arrays["colour_factor"])
-        with one_core_blas():
+        with one_core_blas(), np.errstate(over="ignore", invalid="ignore"):
             table = unfactor_table(self.arrays)
+        check_finite("functions", table)
         return np.ascontiguousarray(np.moveaxis(table, 1, 3))
 
     @cached_property

@@ -114,7 +114,7 @@ def test_missing_file_and_other_files_are_refused(tmp_path, path):
         archive.writestr("a.txt", "b")
     with pytest.raises(FieldFileError, match=r"a ZIP archive without header.json"):
         open_field(tmp_path / "other.rfld")
-    with pytest.raises(FieldFileError, match="damaged"):
+    with pytest.raises(FieldFileError, match=r"expected a file, received a folder"):
         open_field(tmp_path)
 
 
@@ -212,7 +212,7 @@ def test_false_sizes_allocate_nothing(path):
     edit_header(path, lambda h: h["arrays"]["faces"].update(shape=[10**8, 3]))
     tracemalloc.start()
     with pytest.raises(FieldFileError, match=r"faces: expected 1200000000 bytes"):
-        _ = open_field(path).faces
+        _ = open_field(path, max_bytes=1 << 40).faces
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 25  # the dictionary
