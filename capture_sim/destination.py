@@ -147,9 +147,7 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
     if not folder.is_dir():
         if folder.exists() or folder.is_symlink():
             kind = "a file" if folder.exists() else "a link to nothing"
-            raise scene_error(
-                str(folder), "a folder or nothing", kind, "choose another place"
-            )
+            raise scene_error(str(folder), "a folder or nothing", kind, "choose another place")
         return
     if not any(entry.name != INSIDE for entry in folder.iterdir()):
         return

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.color_spaces import LARGEST_PROFILE, ColorSpace
 from reflfield.capture.encoding import LINEAR, Encoding
-from reflfield.capture.image_headers import READABLE, ImageHeader, check_size
+from reflfield.capture.image_headers import READABLE, ImageHeader, check_png, check_size
 from reflfield.capture.image_layers import Layer
 from reflfield.capture.stated_color import radiance_scale, stated_space
 from reflfield.errors import CaptureError
@@ -104,7 +104,9 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
     """
     if header.kind == "raw":
         return _developed(path, header)
-    with _opened(path, header, layer) as file:
+    if header.kind == "png":
+        check_png(path)
+    with _named(path), _opened(path, header, layer) as file:
         spec = file.spec()
         names = layer.colour or _colour_names(path, spec)
         alpha = layer.alpha or _alpha_name(spec)
@@ -134,17 +136,33 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
 
 
 @contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Turn what the library raises, such as on text that is none, into a `CaptureError`."""
+    try:
+        yield
+    except CaptureError:
+        raise
+    except (OSError, ValueError, RuntimeError, LookupError, TypeError, MemoryError) as error:
+        raise _damaged(path, str(error) or type(error).__name__) from error
+
+
+def _error_of(source: Any) -> str:
+    """What the library, or a file that it reads, has to say of what went wrong; once."""
+    try:
+        return str(source.geterror())
+    except UnicodeError:
+        return "it holds text that is none"
+
+
+@contextmanager
 def _opened(path: Path, header: ImageHeader, layer: Layer) -> Iterator[Any]:
     """A file that the library reads, at the part or page that is wanted."""
     config = oiio.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1  # as stored: never multiplied on reading
     with _exr_reader(header, layer):
-        try:
-            file = oiio.ImageInput.open(str(path), config)
-        except UnicodeError as error:
-            raise CaptureError(f"{path}: expected a file name of text; rename it") from error
+        file = oiio.ImageInput.open(str(path), config)
     if file is None:
-        raise _damaged(path, oiio.geterror())
+        raise _damaged(path, _error_of(oiio))
     try:
         if file.format_name() != FORMATS[header.kind]:
             raise CaptureError(
@@ -152,11 +170,11 @@ def _opened(path: Path, header: ImageHeader, layer: Layer) -> Iterator[Any]:
                 f"{path.suffix!r}; rename it"
             )
         if not file.seek_subimage(layer.part, 0):
-            raise _damaged(path, file.geterror())
+            raise _damaged(path, _error_of(file))
         yield file
     finally:
         file.close()
-        oiio.geterror()  # of this thread; left there it would be printed at its end
+        _error_of(oiio)  # of this thread; left there it would be printed at its end
 
 
 @contextmanager
@@ -188,7 +206,7 @@ def _pixels(
     together = indices == list(range(indices[0], indices[0] + len(indices)))
     runs = [(indices[0], indices[-1] + 1)] if together else [(i, i + 1) for i in indices]
     read = [file.read_image(layer.part, 0, *run, wanted) for run in runs]
-    error = file.geterror()
+    error = _error_of(file)
     if error or any(pixels is None for pixels in read):
         raise _damaged(path, error)
     pixels = read[0] if together else np.concatenate(read, axis=2)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -250,6 +251,31 @@ def _png(path: Path, file: IO[bytes]) -> ImageHeader:
     colour_type = chunks[b"IHDR"][9]
     alpha = colour_type in (4, 6) or b"tRNS" in chunks
     return ImageHeader("png", width, height, orientation, alpha, chunks=chunks)
+
+
+def check_png(path: Path) -> None:
+    """Demand that a PNG is whole, by its checksums.
+
+    Of damaged ones the decoder prints a line on standard error, besides failing.
+
+    Raises
+    ------
+    CaptureError
+        If it ends early or a checksum differs.
+    """
+    with path.open("rb") as file:
+        file.seek(8)
+        name = b""
+        while name != b"IEND":
+            head = file.read(8)
+            length, name = struct.unpack(">I4s", head.ljust(8, b"\0"))
+            content = file.read(min(length, os.fstat(file.fileno()).st_size))
+            stored = file.read(4)
+            if stored != struct.pack(">I", zlib.crc32(content, zlib.crc32(name))):
+                raise CaptureError(
+                    f"{path}: expected a PNG image, received a damaged or truncated file (the "
+                    f"checksum of {name!r} differs); copy or export it again"
+                )
 
 
 def _jpeg(path: Path, file: IO[bytes]) -> ImageHeader:

@@ -42,6 +42,9 @@ class CaptureSummary:
         Negative values in the sample.
     silhouettes_given : int
         Views that come with a silhouette file.
+    silhouettes_else : str
+        Where the first view without one has its silhouette from: "alpha", "image" (the whole
+        of it) or "photographs"; empty if all views have a file.
     silhouette_coverage : (low, high) float or None
         Share of the image that the object covers, least and most among the sampled views.
     camera_distances, light_distances : (low, high) float or None
@@ -66,6 +69,7 @@ class CaptureSummary:
     values: tuple[float, float, float]
     n_negative: int
     silhouettes_given: int
+    silhouettes_else: str
     silhouette_coverage: Range | None
     camera_distances: Range | None
     light_distances: Range | None
@@ -133,6 +137,7 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
         values=values,
         n_negative=n_negative,
         silhouettes_given=sum(path is not None for path in capture.silhouettes),
+        silhouettes_else=_silhouettes_else(capture),
         silhouette_coverage=_silhouette_coverage(capture, sample),
         camera_distances=_distances(positions, centre),
         light_distances=_distances(near, centre),
@@ -211,6 +216,11 @@ def _value_ranges(capture: Capture, sample: int) -> tuple[tuple[float, float, fl
     return (min(lows), float(np.mean(highs)), max(tops)), n_negative, len(chosen)
 
 
+def _silhouettes_else(capture: Capture) -> str:
+    others = [view for view, path in enumerate(capture.silhouettes) if path is None]
+    return capture.silhouette_origin(others[0]) if others else ""
+
+
 def _silhouette_coverage(capture: Capture, sample: int) -> Range | None:
     chosen = [i for i in _spread(capture.n_views, sample) if capture.silhouettes[i] is not None]
     if not chosen:
@@ -243,8 +253,13 @@ def _gap(spread: float | None) -> str:
 
 
 def _coverage(summary: CaptureSummary) -> str:
+    origin = {
+        "alpha": ", others are the photographs' alpha",
+        "image": ", others are the whole image",
+        "photographs": ", others made from the photographs",
+    }.get(summary.silhouettes_else, "")
     coverage = summary.silhouette_coverage
     if coverage is None:
-        whole = summary.base_geometry == PLANE
-        return ", others are the whole image" if whole else ", others made from the photographs"
-    return f", covering {100 * coverage[0]:.1f} .. {100 * coverage[1]:.1f} % of the image"
+        return origin
+    low, high = (100 * share for share in coverage)
+    return f", covering {low:.1f} .. {high:.1f} % of the image{origin}"

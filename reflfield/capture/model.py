@@ -286,6 +286,14 @@ class Capture:
         shown = [alpha for alpha in alphas if alpha is not None]
         return np.median(shown, axis=0).astype(np.float32) if shown else None
 
+    def silhouette_origin(self, view: int) -> str:
+        """Where `read_silhouette` has it from: "file", "alpha", "image" or "photographs"."""
+        if self.silhouettes[view] is not None:
+            return "file"
+        if any(self.photographs[i].read_alpha() is not None for i in self._with_alpha(view)):
+            return "alpha"
+        return "image" if self.base_geometry == PLANE else "photographs"
+
     def _with_alpha(self, view: int) -> list[int]:
         """Photographs of a view that are asked for their alpha, evenly spread."""
         return [

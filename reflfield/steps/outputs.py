@@ -207,10 +207,13 @@ def _surface_sections(
     job: Job, field: ReflectanceField, average: NDArray[np.float32]
 ) -> Iterator[Section]:
     texels = job.texels
-    given = any(path is not None for path in job.training.silhouettes)
+    origin = job.training.silhouette_origin(0)
     yield sections.silhouettes_section(
         _silhouette_views(job),
-        origin="given with the capture" if given else "made from the photographs",
+        origin={
+            "file": "given with the capture",
+            "alpha": "alpha of the photographs",
+        }.get(origin, "made from the photographs"),
     )
     yield sections.atlas_section(
         texels.texel_of_pixel,
