@@ -27,6 +27,7 @@ from rich.progress import (
 from reflfield import __version__
 from reflfield.capture.names import printable
 from reflfield.errors import InputError, ReflfieldError
+from reflfield.interrupts import Stopped, ending_on_signals, leaving_work_in_order
 from reflfield.progress import ProgressLines, listening
 
 # The libraries that do the work take seconds to import: commands import what they need,
@@ -73,14 +74,23 @@ def main() -> None:
     notes.addHandler(handler)
     notes.propagate = False
     try:
-        app()
+        with ending_on_signals():
+            app()
     except ReflfieldError as error:
         fail(str(error), error)
     except OSError as error:  # a folder that cannot be written, a full disk
-        fail(f"{error.filename or 'system'}: {error.strerror or error}", error)
+        fail(system_words(error), error)
     finally:
         notes.removeHandler(handler)
         notes.propagate = True
+
+
+def system_words(error: OSError) -> str:
+    """What the system says, and of which file; where it names none, of the working folder."""
+    named = str(error.filename or Path.cwd())
+    if error.filename2:
+        named = f"{named}, {error.filename2}"
+    return f"{named}: {error.strerror or error}"
 
 
 class Notes(logging.Handler):
@@ -102,14 +112,16 @@ def fail(message: str, error: Exception) -> NoReturn:
 def showing_progress(if_interrupted: str = "nothing half-written is left") -> Iterator[None]:
     """Show the progress of all work inside the block, with the time left.
 
-    On a terminal as bars, else as a line now and then. Ctrl-C ends with status 130.
+    On a terminal as bars, else as a line now and then. Ctrl-C ends with status 130, a request
+    to terminate with 143.
     """
     try:
-        with bars() if errors.is_terminal else listening(ProgressLines(say_error)):
+        shown = bars() if errors.is_terminal else listening(ProgressLines(say_error))
+        with leaving_work_in_order(), shown:
             yield
-    except KeyboardInterrupt:
-        say_error(f"reflfield: interrupted; {if_interrupted}")
-        raise typer.Exit(130) from None
+    except Stopped as signal:
+        say_error(f"reflfield: {signal.word}; {if_interrupted}")
+        raise typer.Exit(signal.status) from None
 
 
 @contextmanager

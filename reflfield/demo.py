@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from reflfield.capture.readers import open_capture
+from reflfield.children import tied
 from reflfield.config import HoldOut, Resources
 from reflfield.errors import ReflfieldError
 from reflfield.field.compression import CompressionOptions
@@ -113,7 +114,7 @@ def compiling_ahead() -> Iterator[None]:
     machine. Compiled before, it takes two seconds; if it fails, the run compiles for itself.
     """
     process = subprocess.Popen(
-        [sys.executable, "-c", COMPILE],
+        tied([sys.executable, "-c", COMPILE]),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -129,7 +130,7 @@ def simulate(capture: Path, workers: int) -> None:
     capture.parent.mkdir(parents=True, exist_ok=True)
     report("simulating the dome", 0, 1)
     command = [simulator(), "render", SCENE, "-o", str(capture), "--workers", str(workers)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(tied(command), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise ReflfieldError(
             f"capture-sim: expected status 0, received {done.returncode}: {done.stderr.strip()}"

@@ -21,6 +21,7 @@ from reflfield.config import HoldOut, Resources
 from reflfield.errors import InputError
 from reflfield.file_digests import FileDigests
 from reflfield.folders import only_run
+from reflfield.observations.store import check_place
 from reflfield.progress import report
 from reflfield.stages import plain
 from reflfield.steps import (
@@ -347,6 +348,8 @@ def run(
         redo,
         digests=FileDigests(out / "stages" / FILES_INDEX),
     )
+    if job.resources.store is not None:
+        check_place(job.resources.store, capture=capture.root, out=out)
     check_memory(job)
     choices.check_choices(job)
     with only_run(job.stages.root), telling_where_the_field_is(job):

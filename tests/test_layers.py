@@ -12,6 +12,8 @@ ROOT = Path(__file__).parents[1]
 # From the ground up. A room may import itself and any room to its left.
 ROOMS = (
     "errors",
+    "interrupts",
+    "children",
     "checks",
     "files",
     "folders",
@@ -37,10 +39,15 @@ ROOMS = (
     "pipeline",
     "demo",
     "cli",
+    "__main__",
 )
 # Commands import what they need when they run, so that --help answers at once and Ctrl-C
 # is heard while libraries are imported.
-IMPORTS_LATE = {Path("reflfield/cli.py"), Path("capture_sim/__main__.py")}
+IMPORTS_LATE = {
+    Path("reflfield/cli.py"),
+    Path("reflfield/__main__.py"),
+    Path("capture_sim/__main__.py"),
+}
 
 
 class Import(NamedTuple):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.checks import check_shape
+from reflfield.children import tied
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.box_charts import box_charts
 from reflfield.geometry.mesh import Mesh
@@ -233,7 +234,7 @@ def _run_worker(
         np.savez(source, allow_pickle=False, **job)
         worker = "reflfield.geometry.xatlas_worker"
         done = subprocess.run(
-            [sys.executable, "-m", worker, str(source), str(target)],
+            tied([sys.executable, "-m", worker, str(source), str(target)]),
             env=environment,
             timeout=time_limit_s,
             capture_output=True,

@@ -42,6 +42,8 @@ CHUNK_BYTES = 1 << 20
 VIEWS_PER_CHUNK = 8
 WRITER_BYTES = 128 << 20
 SAMPLE_BYTES = 6
+# In a store: what the folders of samples are called, before the key of their stage.
+SAMPLES_PREFIX = "samples-"
 # What chunks hold that were never written.
 UNWRITTEN = -np.inf
 # Attributes of the array: what its numbers are in, and whether values that count may be NaN.
@@ -229,6 +231,70 @@ def opened(location: Location) -> str | FsspecStore:
             f"{text}: expected a URL that fsspec can open, but {error}; install what it "
             "names, or use a folder"
         ) from error
+
+
+def check_place(store: str, *, capture: Path, out: Path) -> None:
+    """Demand a place for samples where nothing else is, before anything is written.
+
+    Parameters
+    ----------
+    store : str
+        Folder, or URL for fsspec.
+    capture, out : Path
+        Folders of the photographs and of the results.
+
+    Raises
+    ------
+    InputError
+        If it is empty, the root of a file system, the home folder, that of the capture or
+        the results, or a folder that holds anything but samples.
+    """
+    if "://" in store and not store.startswith("file://"):
+        if not store.partition("://")[2].strip("/ "):
+            raise InputError(
+                f"--store: expected a place, such as {store}/name, received {store}"
+            )
+        return
+    text = store.removeprefix("file://")
+    if not text.strip():
+        raise InputError(f"--store: expected a folder or a URL, received {store!r}")
+    reason = _other_use(Path(text).resolve(), capture.resolve(), out.resolve())
+    if reason:
+        raise InputError(
+            f"--store: expected a new or empty folder, or one that holds samples alone, "
+            f"received {text}, {reason}; name another, such as {Path(text) / 'samples'}"
+        )
+
+
+def _other_use(place: Path, capture: Path, out: Path) -> str:
+    """What else a folder is for; empty if nothing."""
+    if place.parent == place:
+        return "the root of the file system"
+    if place == Path.home().resolve():
+        return "the home folder"
+    if place == capture or capture in place.parents:
+        return "which is in the capture's folder"
+    if place == out or out / "stages" in (place, *place.parents):
+        return "the folder of the results"
+    if not place.exists():
+        return ""
+    if not place.is_dir():
+        return "which is no folder"
+    names = sorted(entry.name for entry in place.iterdir())
+    others = [n for n in names if not n.startswith((SAMPLES_PREFIX, ".")) and n != "lost+found"]
+    return f"which holds {others[0]!r}" if others else ""
+
+
+def place_of(store: str, key: str) -> str:
+    """Where a store keeps the samples of a stage's key: a folder is named from the root.
+
+    Examples
+    --------
+    >>> place_of("s3://bucket/run/", "0123456789abcdef" * 4)
+    's3://bucket/run/samples-0123456789abcdef'
+    """
+    place = store if "://" in store else str(Path(store).resolve())
+    return f"{place.rstrip('/')}/{SAMPLES_PREFIX}{key[:16]}"
 
 
 def create_samples(

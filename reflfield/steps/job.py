@@ -21,7 +21,7 @@ from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import TexelReader, grid_sides
-from reflfield.observations.store import Location, ObservationStore, Observed
+from reflfield.observations.store import Location, ObservationStore, Observed, place_of
 from reflfield.scheduling import Blocks, Scheduler
 from reflfield.stages import RESTARTABLE, StageFolder, key_of
 from reflfield.steps.clipping import MEASURED, stored_measured
@@ -107,7 +107,7 @@ class Job:
         """
         if self.resources.store is None:
             return folder / SAMPLES
-        location = f"{self.resources.store.rstrip('/')}/samples-{key_of(folder)[:16]}"
+        location = place_of(self.resources.store, key_of(folder))
         (folder / ELSEWHERE).write_text(location)
         return location
 

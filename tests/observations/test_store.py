@@ -12,10 +12,12 @@ from reflfield.observations import store
 from reflfield.observations.store import (
     ObservationStore,
     Observed,
+    check_place,
     chunk_shape,
     create_samples,
     is_written,
     open_samples,
+    place_of,
 )
 
 
@@ -204,6 +206,56 @@ class TestChunks:
         writer = shape[0] * views * shape[2] * 6
         assert writer <= 128 << 20
         assert texels == shape[0] or 256 <= texels <= 4096
+
+
+class TestPlace:
+    @pytest.fixture
+    def folders(self, tmp_path, monkeypatch):
+        """A capture, a folder of results, a home and a working folder."""
+        monkeypatch.setenv("HOME", str(tmp_path / "home"))
+        for name in ("capture/photographs", "out/stages", "home", "full/music"):
+            (tmp_path / name).mkdir(parents=True)
+        monkeypatch.chdir(tmp_path / "home")
+        return {"capture": tmp_path / "capture", "out": tmp_path / "out"}
+
+    @pytest.mark.parametrize(
+        ("place", "reason"),
+        [
+            ("", "expected a folder or a URL, received ''"),
+            (" ", "expected a folder or a URL, received ' '"),
+            ("file://", "expected a folder or a URL"),
+            ("/", "the root of the file system"),
+            ("file:///", "the root of the file system"),
+            ("//", "the root of the file system"),
+            ("s3://", "expected a place"),
+            ("memory:///", "expected a place"),
+            (".", "the home folder"),
+            ("{}/home", "the home folder"),
+            ("{}/capture", "in the capture's folder"),
+            ("{}/capture/photographs/new", "in the capture's folder"),
+            ("{}/out/../capture", "in the capture's folder"),
+            ("{}/out", "the folder of the results"),
+            ("{}/out/stages", "the folder of the results"),
+            ("{}/out/stages/observations/new", "the folder of the results"),
+            ("{}/full", "which holds 'music'"),
+            ("file://{}/full", "which holds 'music'"),
+        ],
+    )
+    def test_in_use_is_refused(self, folders, tmp_path, place, reason):
+        with pytest.raises(InputError, match=f"--store: .*{reason}"):
+            check_place(place.format(tmp_path), **folders)
+
+    @pytest.mark.parametrize("place", ["{}/new/deep", "{}/empty", "{}/ours", "{}/out/samples",
+                                       "s3://bucket", "memory://name", "relative"])  # fmt: skip
+    def test_of_samples_alone(self, folders, tmp_path, place):
+        for name in ("empty", "ours/samples-0123456789abcdef", "ours/lost+found"):
+            (tmp_path / name).mkdir(parents=True)
+        check_place(place.format(tmp_path), **folders)
+
+    def test_is_named_from_the_root(self, tmp_path, monkeypatch):
+        """A run from another folder finds it again."""
+        monkeypatch.chdir(tmp_path)
+        assert place_of("samples", "f" * 64) == f"{tmp_path}/samples/samples-ffffffffffffffff"
 
 
 class TestObserved:

@@ -5,6 +5,7 @@ import json
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -62,17 +63,27 @@ class TestExitStatus:
         assert outcome.out == ""
         assert "Usage" in outcome.err
 
-    def test_interruption_ends_with_130(self, reflfield, tiny_capture, tmp_path, monkeypatch):
-        def interrupted(*_, **__):
-            raise KeyboardInterrupt
+    @pytest.mark.parametrize(
+        ("number", "status", "word"),
+        [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
+    )
+    def test_signals_at_work(
+        self, reflfield, tiny_capture, tmp_path, monkeypatch, number, status, word
+    ):
+        def stopped(*_, **__):
+            signal.raise_signal(number)
 
-        monkeypatch.setattr("reflfield.steps.surface.visual_hull", interrupted)
+        monkeypatch.setattr("reflfield.steps.surface.visual_hull", stopped)
+        handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+        monkeypatch.setattr(signal, "getsignal", lambda number: signal.SIG_DFL)
         outcome = reflfield("run", tiny_capture, "-o", tmp_path / "out")
-        assert outcome.status == 130
+        monkeypatch.undo()
+        assert outcome.status == status
         assert outcome.out == ""
-        assert outcome.err.splitlines() == [f"reflfield: interrupted; {cli.GOES_ON}"]
+        assert outcome.err.splitlines() == [f"reflfield: {word}; {cli.GOES_ON}"]
         stages = tmp_path / "out" / "stages"
-        assert {p.name for p in stages.iterdir()} == {".lock", "silhouettes"}
+        assert {p.name for p in stages.iterdir()} == {".lock", "files.json", "silhouettes"}
+        assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
 
     def test_a_defect_keeps_its_traceback(self, reflfield, tiny_capture, monkeypatch, tmp_path):
         def broken(*_, **__):
