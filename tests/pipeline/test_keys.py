@@ -29,10 +29,10 @@ OPTIONS = with_tables(
         "comparison": {"without_alignment": True, "rate_distortion": True},
     },
 )
-SURFACE = ("silhouettes", "hull", "atlas", "visibility")
 FIELD = ("indirect", "completion", "alignment", "resampling", "compression")
 LATER = ("maps", "without_alignment", "comparison", "rate_distortion", "report")
 REFLECTANCE = ("observations", *FIELD, *LATER)
+AFTER_HULL = ("atlas", "visibility", "frame_silhouettes", *REFLECTANCE)
 
 
 class Keys(StageFolder):
@@ -73,7 +73,7 @@ def keys(folder, options=OPTIONS, hold_out=None, **resources):
 @pytest.fixture(scope="module")
 def usual(capture_folder):
     found = keys(capture_folder)
-    assert set(found) == {*SURFACE, *REFLECTANCE}
+    assert set(found) == {"silhouettes", "hull", *AFTER_HULL}
     return found
 
 
@@ -127,17 +127,17 @@ def photograph(job_part):
 INPUTS = {
     "a camera's focal length": (
         described(lambda d: d["cameras"][0].update(fl_x=d["cameras"][0]["fl_x"] * 1.01)),
-        {*SURFACE, *REFLECTANCE},
+        {"silhouettes", "hull", *AFTER_HULL},
     ),
     "a light's position": (
         described(lambda d: d["lights"][0].update(position=[1, 2, 3])),
-        {"hull", "atlas", "visibility", *REFLECTANCE},
+        {"hull", *AFTER_HULL},
     ),
     "a light's intensity": (
         described(lambda d: d["lights"][0].update(intensity=[3, 2, 1])),
-        {"hull", "atlas", "visibility", *REFLECTANCE},
+        {"hull", *AFTER_HULL},
     ),
-    "a silhouette": (another_silhouette, {*SURFACE, *REFLECTANCE}),
+    "a silhouette": (another_silhouette, {"silhouettes", "hull", *AFTER_HULL}),
     "a photograph": (bits(photograph("training")), {*REFLECTANCE}),
     "a held-out photograph": (
         bits(photograph("held_frames")),
@@ -170,7 +170,7 @@ def test_what_is_held_out(capture_folder, usual):
 # What is computed again with an option of a table, or with one of them.
 AFTER_COMPRESSION = {"compression", *LATER}
 TABLES = {
-    "hull": {"hull", "atlas", "visibility", *REFLECTANCE},
+    "hull": {"hull", *AFTER_HULL},
     "texture": {"atlas", "visibility", *REFLECTANCE},
     "atlas": {"atlas", "visibility", *REFLECTANCE},
     "visibility": {"visibility", *REFLECTANCE},
