@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -457,11 +456,13 @@ def image_reading(encoding: str | None, layer: str | None) -> Any:
 
 def n_workers(wanted: int) -> int:
     """Threads to use; 0 takes one per core that this process may use."""
-    if wanted < 0:
-        raise InputError(f"--workers: expected 0 or more, received {wanted}")
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return wanted or len(os.sched_getaffinity(0))
-    return wanted or os.cpu_count() or 1
+    from reflfield.config import MOST_WORKERS, available_cores
+
+    if not 0 <= wanted <= MOST_WORKERS:
+        raise InputError(
+            f"--workers: expected 1 to {MOST_WORKERS}, or 0 for one per core, received {wanted}"
+        )
+    return wanted or available_cores()
 
 
 def pipeline_options(config: Path | None, settings: list[str]) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import re
 import tomllib
 import types
@@ -23,6 +24,8 @@ Options = TypeVar("Options")
 LARGEST_FILE = 1 << 20
 # Libraries and code take 0.4 GB before the first photograph is read.
 LEAST_MEMORY = 1 << 30
+# Threads beyond any machine's cores: a number above is a slip.
+MOST_WORKERS = 1024
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -235,8 +238,10 @@ class Resources:
     store: str | None = None
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise InputError(f"--workers: expected at least 1, received {self.workers}")
+        if not 1 <= self.workers <= MOST_WORKERS:
+            raise InputError(
+                f"--workers: expected 1 to {MOST_WORKERS}, received {self.workers}"
+            )
         if self.max_memory < LEAST_MEMORY:
             raise InputError(
                 f"--max-memory: expected at least {gigabytes(LEAST_MEMORY)}, received "
@@ -247,6 +252,13 @@ class Resources:
     def block_bytes(self) -> int:
         """Working memory for one block of texels; each thread has one."""
         return min(self.max_memory // (8 * self.workers), 256 << 20)
+
+
+def available_cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def gigabytes(size: float) -> str:

@@ -15,7 +15,7 @@ from reflfield.comparison.metrics import COVERAGE_OF_OBJECT
 from reflfield.errors import CaptureError
 from reflfield.files import load_arrays
 from reflfield.geometry.mesh import Mesh
-from reflfield.geometry.visibility import RayScene
+from reflfield.geometry.ray_scene import RayScene
 
 Float32 = NDArray[np.float32]
 
@@ -24,7 +24,6 @@ GIVEN, ALPHA, PHOTOGRAPHS, HULL, IMAGE = "given", "alpha", "photographs", "hull"
 # Under fewer lights a side of the object may be dark in all photographs of a view.
 LEAST_PHOTOGRAPHS = 4
 ORIGINS = "origins.json"
-ROWS_AT_ONCE = 256
 HEADER_BYTES = 4096
 
 
@@ -122,11 +121,4 @@ def _coverage(capture: Capture, view: int, scene: RayScene) -> tuple[Float32, st
 
 def projected_coverage(scene: RayScene, camera: Camera) -> Float32:
     """1 where the ray through a pixel's centre meets the mesh, else 0; (h, w) float32."""
-    coverage = np.zeros((camera.height, camera.width), np.float32)
-    for first in range(0, camera.height, ROWS_AT_ONCE):
-        rows = np.arange(first, min(first + ROWS_AT_ONCE, camera.height))
-        row, column = np.meshgrid(rows, np.arange(camera.width), indexing="ij")
-        pixels = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=1)
-        covered = np.isfinite(scene.pixel_depths(camera, pixels))
-        coverage[rows] = covered.reshape(row.shape)
-    return coverage
+    return scene.silhouette(camera).astype(np.float32)

@@ -20,8 +20,8 @@ from skimage.measure import marching_cubes
 from reflfield.capture.cameras import Camera
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.mesh import Mesh, decimate, keep_large_components, smooth
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.silhouettes import SignedDistance, signed_distance
-from reflfield.geometry.visibility import RayScene
 from reflfield.progress import track
 
 Array = NDArray[np.float64]

@@ -86,7 +86,7 @@ class EnvironmentMap:
         check_shape("radiance", self.radiance, (None, None, 3))
         height, width, _ = self.radiance.shape
         check_latlong("radiance", width, height)
-        _check_radiance("radiance", self.radiance)
+        _check_finite(self.radiance)
         if self.convention not in CONVENTIONS:
             raise InputError(
                 f"convention: expected one of {', '.join(CONVENTIONS)}, "
@@ -122,7 +122,6 @@ class EnvironmentMap:
         width, height = image_size(path)
         check_latlong(str(path), width, height)
         radiance = read_image(path, what="environment map")
-        _check_radiance(str(path), radiance)
         _tell_of_oddities(path, radiance)
         rotation = None
         if world_from_environment is not None:
@@ -263,15 +262,14 @@ def check_latlong(name: str, width: int, height: int) -> None:
     )
 
 
-def _check_radiance(name: str, radiance: NDArray[np.floating]) -> None:
+def _check_finite(radiance: NDArray[np.floating]) -> None:
     finite = np.isfinite(radiance).all(axis=2)
     if not finite.all():
         row, column = np.argwhere(~finite)[0]
         raise InputError(
-            f"{name}: expected a map of finite radiance, received "
+            f"radiance: expected a map of finite radiance, received "
             f"{int((~finite).sum())} pixels of NaN or infinity, first at row {row}, column "
-            f"{column}: {radiance[row, column].tolist()}; repair the map (half floats store a "
-            "sun beyond 65504 as infinity: write 32 bits, or clamp it)"
+            f"{column}: {radiance[row, column].tolist()}; repair the map"
         )
 
 

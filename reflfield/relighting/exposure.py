@@ -16,6 +16,8 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 # Share of the object's pixels that is not clipped to white.
 PERCENTILE = 99.5
 
+# Rows of a picture that are encoded together.
+ROWS_AT_ONCE = 64
 # Luminances kept of each frame: enough for a percentile, little to hold.
 SAMPLES_PER_FRAME = 4096
 
@@ -47,8 +49,9 @@ def covered_luminances(
     -------
     (n,) float64
     """
-    filled = luminance(image)[coverage > 0.99]
-    return filled[:: max(len(filled) // SAMPLES_PER_FRAME, 1)]
+    filled = np.flatnonzero(np.asarray(coverage).ravel() > 0.99)
+    chosen = filled[:: max(len(filled) // SAMPLES_PER_FRAME, 1)]
+    return luminance(np.asarray(image).reshape(-1, 3)[chosen])
 
 
 def common_exposure(luminances: Iterable[NDArray[np.float64]]) -> float:
@@ -89,4 +92,10 @@ def encoded_picture(image: NDArray[np.floating], exposure: float) -> NDArray[np.
     """
     if not (np.isfinite(exposure) and exposure > 0):
         raise InputError(f"exposure: expected a positive number, received {exposure}")
-    return np.rint(encode_srgb(np.asarray(image, np.float64) * exposure) * 255).astype(np.uint8)
+    linear = np.asarray(image)
+    picture = np.zeros(linear.shape, np.uint8)
+    # Strip by strip: double precision of a whole photograph takes ten times its memory.
+    for first in range(0, len(linear), ROWS_AT_ONCE):
+        rows = np.asarray(linear[first : first + ROWS_AT_ONCE], np.float64)
+        picture[first : first + ROWS_AT_ONCE] = np.rint(encode_srgb(rows * exposure) * 255)
+    return picture

@@ -13,6 +13,7 @@ from PIL import Image
 
 from reflfield.capture.cameras import OPENCV, Camera, looking_at
 from reflfield.capture.image_writing import write_png
+from reflfield.checks import unit_direction
 from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField
 from reflfield.files import replacing
@@ -23,6 +24,16 @@ from reflfield.relighting.renderer import Lighting, Renderer, RenderOptions
 Array = NDArray[np.float64]
 
 
+# Least and most of each number.
+RANGES: dict[str, tuple[float, float]] = {
+    "n_frames": (1, 3600),
+    "size": (1, 16383),
+    "elevation_deg": (-89, 89),
+    "field_of_view_deg": (1, 150),
+    "frames_per_second": (0.1, 1000),
+}
+
+
 @dataclass(frozen=True)
 class OrbitOptions:
     """Where the turntable's cameras stand and what they deliver.
@@ -30,7 +41,7 @@ class OrbitOptions:
     Parameters
     ----------
     n_frames : int
-        Cameras on the full circle.
+        Cameras on the full circle, 1 to 3600.
     up : (3,) tuple of float
         Axis of the turntable, world.
     elevation_deg : float
@@ -39,9 +50,9 @@ class OrbitOptions:
     field_of_view_deg : float
         Angle of view, degrees; the distance follows, so that the bounding sphere fits.
     size : int
-        Width and height of a frame, pixels.
+        Width and height of a frame, pixels, 1 to 16383 (the largest of WebP).
     frames_per_second : float
-        Speed of the animation.
+        Speed of the animation, 0.1 to 1000.
     exposure : float, optional
         Factor before the sRGB encoding; by default that of `common_exposure`.
 
@@ -60,25 +71,12 @@ class OrbitOptions:
     exposure: float | None = None
 
     def __post_init__(self) -> None:
-        if self.n_frames < 1 or self.size < 1:
-            raise InputError(
-                f"n_frames, size: expected at least 1, received {self.n_frames}, {self.size}"
-            )
-        if not np.linalg.norm(self.up) > 0:
-            raise InputError(f"up: expected a vector that is not zero, received {self.up}")
-        if not abs(self.elevation_deg) <= 89:
-            raise InputError(
-                f"elevation_deg: expected -89 to 89 degrees, received {self.elevation_deg}"
-            )
-        if not 1 <= self.field_of_view_deg <= 150:
-            raise InputError(
-                f"field_of_view_deg: expected 1 to 150 degrees, "
-                f"received {self.field_of_view_deg}"
-            )
-        if not self.frames_per_second > 0:
-            raise InputError(
-                f"frames_per_second: expected > 0, received {self.frames_per_second}"
-            )
+        for name, (least, most) in RANGES.items():
+            if not least <= getattr(self, name) <= most:
+                raise InputError(
+                    f"{name}: expected {least} to {most}, received {getattr(self, name)}"
+                )
+        unit_direction("up", self.up)
 
 
 @dataclass(frozen=True)
@@ -264,8 +262,7 @@ def contact_sheet(
 
 def _circle(options: OrbitOptions) -> list[Array]:
     """Unit vectors from the object's centre to the cameras."""
-    up = np.asarray(options.up, np.float64)
-    up = up / np.linalg.norm(up)
+    up = unit_direction("up", options.up)
     axis = np.eye(3)[np.argmin(np.abs(up))]
     ahead = axis - (axis @ up) * up
     ahead /= np.linalg.norm(ahead)

@@ -16,8 +16,9 @@ from reflfield.field.evaluation import texel_taps
 from reflfield.field.model import ReflectanceField
 from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import texel_table
-from reflfield.geometry.visibility import RayScene, VisibilityOptions
+from reflfield.geometry.visibility import VisibilityOptions
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -11,17 +11,17 @@ their texels.
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from math import isqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import ENVIRONMENT, UNKNOWN, Light
+from reflfield.config import MOST_WORKERS, available_cores
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate, sum_lights
 from reflfield.field.model import ReflectanceField
@@ -42,6 +42,19 @@ Lighting = Light | EnvironmentMap | Sequence[Light | EnvironmentMap]
 _NODES_AT_ONCE = 1 << 22
 
 
+# Shadow rays of an environment that are traced together: 80 MB.
+_SHADOW_RAYS_AT_ONCE = 1 << 18
+
+# Least and most of each option.
+RANGES: dict[str, tuple[float, float]] = {
+    "samples_per_pixel": (1, 4096),
+    "environment_directions": (1, 16384),
+    "block_pixels": (1, 1 << 20),
+    "workers": (0, MOST_WORKERS),
+    "ray_offset": (0.0, 0.1),
+}
+
+
 @dataclass(frozen=True)
 class RenderOptions:
     """How pictures are made.
@@ -49,17 +62,18 @@ class RenderOptions:
     Parameters
     ----------
     samples_per_pixel : int
-        Rays through a pixel, a square number: a regular grid, the same in
+        Rays through a pixel, a square number from 1 to 4096: a regular grid, the same in
         every pixel, so nothing is random.
     environment_directions : int
-        Directional lights that stand for an environment map.
+        Directional lights that stand for an environment map, 1 to 16384.
     block_pixels : int
-        Pixels worked on together by one thread. Memory grows with it; the
+        Pixels worked on together by one thread, 1 to 1048576. Memory grows with it; the
         picture does not depend on it.
     workers : int
-        Threads; 0 takes one for each processor core. The picture does not depend on it.
+        Threads, at most 1024; 0 takes one for each processor core. The picture does not
+        depend on it.
     ray_offset : float
-        Height at which shadow rays start, in diagonals of the mesh.
+        Height at which shadow rays start, in diagonals of the mesh, 0 to 0.1.
 
     Raises
     ------
@@ -74,24 +88,21 @@ class RenderOptions:
     ray_offset: float = 2e-4
 
     def __post_init__(self) -> None:
-        for name in ("samples_per_pixel", "environment_directions", "block_pixels"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
-        if round(self.samples_per_pixel**0.5) ** 2 != self.samples_per_pixel:
+        for name, (least, most) in RANGES.items():
+            if not least <= getattr(self, name) <= most:
+                raise InputError(
+                    f"{name}: expected {least} to {most}, received {getattr(self, name)}"
+                )
+        if isqrt(self.samples_per_pixel) ** 2 != self.samples_per_pixel:
             raise InputError(
                 f"samples_per_pixel: expected a square number, "
                 f"received {self.samples_per_pixel}; take 1, 4, 9, 16, ..."
-            )
-        if self.workers < 0 or not self.ray_offset >= 0:
-            raise InputError(
-                "workers, ray_offset: expected >= 0, "
-                f"received {self.workers}, {self.ray_offset}"
             )
 
     @property
     def n_threads(self) -> int:
         """Threads to run."""
-        return self.workers or os.cpu_count() or 1
+        return self.workers or available_cores()
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +171,8 @@ class Renderer:
     def __init__(self, field: ReflectanceField, options: RenderOptions | None = None) -> None:
         self.field = field
         self.options = options or RenderOptions()
-        self.surface = FieldSurface(field, self.options.n_threads, self.options.ray_offset)
+        # Blocks have threads of their own: their rays are traced by the thread that asks.
+        self.surface = FieldSurface(field, 1, self.options.ray_offset)
         self._environments: dict[object, EnvironmentLighting] = {}
         # Decoded here, before threads could each do it.
         _ = (field.node_table, field.component_weights, field.local_from_world)
@@ -314,7 +326,6 @@ class EnvironmentLighting:
         n_texels = surface.field.n_texels
         self._traced = np.zeros(n_texels, np.bool_)
         self._lit_bits = np.zeros((0, 0), np.uint8)
-        self._lock = threading.Lock()
         self._factored = surface.field.visibility == "factored"
         self._positions, self._normals = surface.texel_points
         if self._factored:
@@ -340,15 +351,15 @@ class EnvironmentLighting:
 
     def _lit(self, texels: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(n, n_lights) bool: True where a light reaches a texel."""
-        # One thread traces at a time: Embree's own threads share the work.
-        with self._lock:
-            missing = texels[~self._traced[texels]]
-            if len(missing):
-                self._trace(missing)
+        missing = texels[~self._traced[texels]]
+        at_once = max(_SHADOW_RAYS_AT_ONCE // len(self._lights), 1)
+        for first in range(0, len(missing), at_once):
+            self._trace(missing[first : first + at_once])
         bits = np.unpackbits(self._lit_bits[texels], axis=1, count=len(self._lights))
         return bits.astype(np.bool_)
 
     def _trace(self, texels: NDArray[np.int32]) -> None:
+        """Trace and keep; two threads that trace the same texel write the same bits."""
         n, m = len(texels), len(self._lights)
         reached = self._surface.reached_by_light(
             np.repeat(self._positions[texels], m, axis=0),

@@ -21,7 +21,7 @@ from reflfield.comparison.report import ReportContent, Section, write_report
 from reflfield.export.gltf import write_glb
 from reflfield.field.file import describe, open_field
 from reflfield.field.model import ReflectanceField
-from reflfield.geometry.visibility import RayScene
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.observations.store import ObservationStore
 from reflfield.stages import plain, versions
 from reflfield.steps import choices, evaluation, holding_out
@@ -234,9 +234,6 @@ def _silhouette_views(job: Job) -> Iterator[sections.SilhouetteView]:
     for i, camera in enumerate(job.training.cameras):
         photographs = job.training.photograph_index[i]
         photographed = photographs[photographs >= 0]
-        row, column = np.indices((camera.height, camera.width))
-        pixels = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=1)
-        covered = np.isfinite(scene.pixel_depths(camera, pixels))
         yield sections.SilhouetteView(
             name=camera.id,
             photograph=(
@@ -245,7 +242,7 @@ def _silhouette_views(job: Job) -> Iterator[sections.SilhouetteView]:
                 else np.zeros((camera.height, camera.width, 3), np.float32)
             ),
             silhouette=job.view_silhouettes[i],
-            hull_silhouette=covered.reshape(camera.height, camera.width).astype(np.float32),
+            hull_silhouette=scene.silhouette(camera),
         )
 
 

@@ -18,9 +18,9 @@ from reflfield.geometry.atlas import Atlas, build_atlas
 from reflfield.geometry.hull import visual_hull
 from reflfield.geometry.mesh import Mesh, write_ply
 from reflfield.geometry.plane import image_plane
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import TexelTable
 from reflfield.geometry.visibility import (
-    RayScene,
     VisibilityOptions,
     check_light_outside,
     light_visibility,

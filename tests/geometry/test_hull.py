@@ -4,7 +4,7 @@ import rigs
 
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.hull import HullOptions, visual_hull
-from reflfield.geometry.visibility import RayScene
+from reflfield.geometry.ray_scene import RayScene
 
 RAW = HullOptions(resolution=64, blur=0.0, smoothing=0, n_triangles=0)
 

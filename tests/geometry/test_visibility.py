@@ -7,9 +7,9 @@ from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.geometry.atlas import Atlas, AtlasOptions, build_atlas
 from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import texel_table
 from reflfield.geometry.visibility import (
-    RayScene,
     VisibilityOptions,
     check_light_outside,
     depth_edges,
@@ -228,3 +228,36 @@ def test_rays_that_start_far_away_keep_their_digits():
     top = 1e4 - 2.1  # the small ball's pole is a vertex of its icosphere
     assert scene.first_hit(start, way)[0] == pytest.approx(top, abs=1e-5)
     assert scene.occluded(start, way, [top - 1e-3, top + 1e-3]).tolist() == [False, True]
+
+
+def test_edges_do_not_depend_on_the_strips_that_they_are_found_in(monkeypatch):
+    """And large photographs are gone through strip by strip: five rows here."""
+    sphere = trimesh.creation.icosphere(2)
+    ball = Mesh(sphere.vertices, sphere.faces)
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    camera = Camera("v", "opencv", 40, 33, 50.0, 50.0, 20.0, 16.5, pose)
+    scene, options = RayScene(ball), VisibilityOptions(edge_band=2.5)
+    whole, covered = depth_edges(scene, camera, options), scene.silhouette(camera)
+    rows = []
+    traced = RayScene.row_depths
+
+    def row_depths(self, camera, first, end):
+        rows.append(end - first)
+        return traced(self, camera, first, end)
+
+    monkeypatch.setattr("reflfield.geometry.ray_scene.RAYS_AT_ONCE", 200)
+    monkeypatch.setattr(RayScene, "row_depths", row_depths)
+    assert np.array_equal(depth_edges(scene, camera, options), whole)
+    assert np.array_equal(scene.silhouette(camera), covered)
+    # Five rows, and as many on both sides as the band and one neighbour reach.
+    assert max(rows) == 5 + 2 * 4
+    assert 100 < whole.sum() < 40 * 33 / 2
+    assert 500 < covered.sum() < 700
+
+
+def test_threads_of_a_query_are_no_more_than_cores():
+    square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]])
+    scene = RayScene(square, threads=100_000)
+    distance, _, _ = scene.first_hit([[0.6, 0.2, 3.0]], [[0, 0, -1]])
+    assert distance.tolist() == [3.0]

@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reflfield.capture.images import read_image, write_exr
 
+from reflfield.capture.image_files import read_image
+from reflfield.capture.image_writing import write_exr
 from reflfield.capture.readers import open_capture
 from reflfield.comparison.coverage import projected_coverage, write_frame_silhouettes
 from reflfield.comparison.metrics import object_pixels
 from reflfield.config import HoldOut
 from reflfield.geometry.mesh import read_ply
-from reflfield.geometry.visibility import RayScene
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.steps.holding_out import split_of
 
 BARE = (

@@ -19,6 +19,7 @@ from reflfield.field.synthetic import (
     sphere_surface,
     square_surface,
 )
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.relighting.rays import pixel_window
 from reflfield.relighting.renderer import Renderer, RenderOptions, render
 
@@ -311,7 +312,7 @@ def test_unknown_lights_are_refused_where_lights_were_known():
     ("change", "text"),
     [
         ({"samples_per_pixel": 5}, "samples_per_pixel: expected a square number"),
-        ({"samples_per_pixel": 0}, "samples_per_pixel: expected at least 1"),
+        ({"samples_per_pixel": 0}, "samples_per_pixel: expected 1 to 4096"),
         ({"block_pixels": 0}, "block_pixels"),
         ({"workers": -1}, "workers"),
         ({"ray_offset": float("nan")}, "ray_offset"),
@@ -412,3 +413,32 @@ def test_shadows_show_indirect_light():
     pictures = [render(f, camera, front, ONE_THREAD).image for f in (traced, kept)]
     np.testing.assert_array_equal(*pictures)
     np.testing.assert_allclose(pictures[0], 1.0, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"samples_per_pixel": 10**10}, "samples_per_pixel: expected 1 to 4096, received 1000"),
+        ({"environment_directions": 10**6}, "environment_directions: expected 1 to 16384"),
+        ({"block_pixels": 10**9}, "block_pixels: expected 1 to 1048576"),
+        ({"workers": 10**9}, "workers: expected 0 to 1024"),
+        ({"ray_offset": 1e300}, "ray_offset: expected 0.0 to 0.1"),
+    ],
+)
+def test_numbers_beyond_any_use_are_refused(change, text):
+    with pytest.raises(InputError, match=text):
+        RenderOptions(**change)
+
+
+def test_a_block_traces_with_the_thread_that_it_has(monkeypatch):
+    """Threads of blocks times threads of queries would be their square."""
+    asked = []
+
+    class Scene(RayScene):
+        def __init__(self, mesh, threads=0):
+            asked.append(threads)
+            super().__init__(mesh, threads)
+
+    monkeypatch.setattr("reflfield.relighting.rays.RayScene", Scene)
+    Renderer(baked_field(square_surface(2), constant(0.3)), RenderOptions(workers=7))
+    assert asked == [1]
