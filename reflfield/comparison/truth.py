@@ -12,7 +12,10 @@ Pictures against true pictures are `reflfield.comparison.metrics.compare_frames`
 
 from __future__ import annotations
 
+import io
 import math
+import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,14 +29,15 @@ from scipy.spatial import cKDTree
 from reflfield.capture.documents import read_json
 from reflfield.checks import check_shape
 from reflfield.errors import CaptureError, InputError, ShapeError
-from reflfield.files import check_regular, load_arrays
+from reflfield.files import load_arrays, read_bytes
 from reflfield.geometry.open3d_library import open3d
 
 Array = NDArray[np.float64]
 
 TRUTH_VERSION = 1
-# A file that takes more memory is not read.
-MOST_BYTES = 2 << 30
+# A file that takes more memory is not read; nor a view of more than eleven doubles a pixel.
+MOST_BYTES = 1 << 30
+BYTES_PER_PIXEL = 88
 # Arrays of the files, and the lengths of their axes; one name is one length within a file.
 VIEW_SHAPES = {
     "depth": "h w",
@@ -103,10 +107,13 @@ class Truth:
     def mesh(self) -> tuple[Array, NDArray[np.int32]]:
         """Vertices (n, 3), metres, and faces (m, 3) of the true surface."""
         path = self.path("mesh", "truth/mesh.ply")
-        if check_regular(path, CaptureError) > MOST_BYTES:
-            raise CaptureError(f"{path}: expected a mesh of at most {MOST_BYTES:,} bytes")
+        if path.suffix.lower() != ".ply":
+            raise CaptureError(f"{path}: expected a mesh in a PLY file")
+        content = read_bytes(path, MOST_BYTES, CaptureError)
         try:
-            loaded = trimesh.load(path, process=False, force="mesh")
+            loaded = trimesh.load(
+                io.BytesIO(content), file_type="ply", process=False, force="mesh"
+            )
             vertices = np.array(loaded.vertices, np.float64).reshape(-1, 3)
             faces = np.array(loaded.faces, np.int32).reshape(-1, 3)
         except Exception as error:  # whatever its readers raise on damaged files
@@ -114,29 +121,40 @@ class Truth:
             raise CaptureError(
                 f"{path}: expected a mesh, received a damaged or different file ({text})"
             ) from error
-        inside = ((faces >= 0) & (faces < len(vertices))).all()
+        promised = re.search(rb"element[ \t]+face[ \t]+(\d{1,18})", content)
+        whole = promised is None or int(promised[1]) <= len(faces)
+        inside = whole and ((faces >= 0) & (faces < len(vertices))).all()
         if not len(faces) or not inside or not np.isfinite(vertices).all():
             raise CaptureError(
                 f"{path}: expected a mesh of faces between finite vertices, received "
-                f"{len(vertices)} vertices and {len(faces)} faces that are not"
+                f"{len(vertices)} vertices and {len(faces)} faces that are not, or not all"
             )
         return vertices, faces
 
-    def view(self, camera_id: str) -> TruthView:
-        """What the camera of this name truly sees."""
+    def view(self, camera_id: str, size: tuple[int, int] | None = None) -> TruthView:
+        """What the camera of this name, of (width, height) pixels, truly sees."""
         path, names = self._view_path(camera_id), TruthView.__annotations__
-        arrays = load_arrays(path, MOST_BYTES, CaptureError, names)
+        most = MOST_BYTES if size is None else BYTES_PER_PIXEL * (size[0] * size[1] + 1024)
+        arrays = load_arrays(path, most, CaptureError, names)
         _check_arrays(path, arrays, VIEW_SHAPES)
+        if size is not None and arrays["depth"].shape != size[::-1]:
+            raise CaptureError(
+                f"{path}: expected {size[0]} x {size[1]} pixels as the camera has, received "
+                f"{arrays['depth'].shape[1]} x {arrays['depth'].shape[0]}"
+            )
+        for name in ("position", "normal", "tangent", "depth"):
+            if np.isnan(arrays[name]).any():
+                raise CaptureError(f"{path}: {name}: expected numbers, received NaN")
         return TruthView(**{name: arrays[name] for name in names})
 
     def has_view(self, camera_id: str) -> bool:
         """Whether the truth of this camera's pixels was written."""
-        return self._view_path(camera_id).is_file()
+        return os.path.lexists(self._view_path(camera_id))
 
     def heldout(self) -> Path | None:
         """The frames file of unseen views and lights, if there is one."""
         path = self.path("heldout", "truth/heldout.json")
-        return path if path.exists() else None
+        return path if os.path.lexists(path) else None
 
     def samples(self) -> dict[str, NDArray[Any]] | None:
         """True apparent BRDFs of some surface points (``abrdf.npz``), if written.
@@ -144,7 +162,7 @@ class Truth:
         See `SAMPLE_SHAPES`. Positions and directions are finite; samples may be NaN.
         """
         path = self.path("abrdf", "truth/abrdf.npz")
-        if not path.exists():
+        if not os.path.lexists(path):
             return None
         arrays = load_arrays(path, MOST_BYTES, CaptureError, SAMPLE_SHAPES)
         _check_arrays(path, arrays, SAMPLE_SHAPES)
@@ -155,12 +173,20 @@ class Truth:
 
     def path(self, key: str, default: str) -> Path:
         """File that ``truth.json`` names under a key, inside the capture."""
-        named = self.description.get(key, default)
-        return _inside(self.root, named if isinstance(named, str) else default)
+        return _inside(self.root, self._named(key, default))
 
     def _view_path(self, camera_id: str) -> Path:
-        pattern = self.description.get("views", "truth/views/{camera}.npz")
-        return _inside(self.root, str(pattern).replace("{camera}", camera_id))
+        pattern = self._named("views", "truth/views/{camera}.npz")
+        return _inside(self.root, pattern.replace("{camera}", camera_id))
+
+    def _named(self, key: str, default: str) -> str:
+        named = self.description.get(key, default)
+        if not isinstance(named, str):
+            raise CaptureError(
+                f"{self.root / 'truth' / 'truth.json'}: {key}: expected a path, received "
+                f"{named!r:.100}"
+            )
+        return named
 
 
 def open_truth(root: Path | str) -> Truth | None:
@@ -182,7 +208,7 @@ def open_truth(root: Path | str) -> Truth | None:
         If the file is not valid or of a newer version.
     """
     path = Path(root) / "truth" / "truth.json"
-    if not path.exists():
+    if not os.path.lexists(path):
         return None
     description = read_json(path)
     version = description.get("version")
@@ -612,7 +638,11 @@ def completion_error(
 
 def _inside(root: Path, relative: str) -> Path:
     path = root / relative
-    if not path.resolve().is_relative_to(root.resolve()):
+    try:
+        inside = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a NUL character
+        raise CaptureError(f"{relative!r}: expected a path, received none ({error})") from error
+    if not inside:
         raise CaptureError(f"{relative!r}: expected a path inside {root}, received one outside")
     return path
 

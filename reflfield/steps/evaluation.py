@@ -258,10 +258,10 @@ def frame_scores(
     One turn about the normal is free for each target and material; of the base frames, which
     have no target, for each material.
     """
-    cameras = [c.id for c in job.training.cameras if truth.has_view(c.id)]
+    cameras = [c for c in job.training.cameras if truth.has_view(c.id)]
     if not cameras:
         return None
-    surface = surface_points([truth.view(c) for c in cameras])
+    surface = surface_points(truth.view(c.id, (c.width, c.height)) for c in cameras)
     seen = job.seen_texels
     reach = MATCH_SPACINGS * job.texels.spacing
     position = job.texels.position[seen]

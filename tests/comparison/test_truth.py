@@ -2,12 +2,14 @@
 
 import json
 import math
+import os
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from reflfield.capture.readers import open_capture
 from reflfield.comparison.truth import (
     SurfacePoints,
     TruthView,
@@ -391,6 +393,61 @@ def test_samples_that_do_not_hold_together_are_refused(capture, spoil, words):
     np.savez(capture / "truth" / "abrdf.npz", **arrays)
     with pytest.raises(CaptureError, match=words):
         open_truth(capture).samples()
+
+
+def test_a_view_of_another_size_or_with_nan_is_refused(capture):
+    truth = open_truth(capture)
+    assert truth.view("v000", (5, 4)).depth.shape == (4, 5)
+    with pytest.raises(CaptureError, match=r"v000\.npz: expected 6 x 4 .*received 5 x 4"):
+        truth.view("v000", (6, 4))
+    arrays = dict(vars(small_view()))
+    arrays["normal"] = np.full_like(arrays["normal"], np.nan)
+    np.savez(capture / "truth" / "views" / VIEW, **arrays)
+    with pytest.raises(CaptureError, match=r"v000\.npz: normal: expected .* received NaN"):
+        truth.view("v000")
+
+
+def test_views_that_inflate_beyond_their_camera_are_not_unpacked(capture):
+    arrays = {**vars(small_view()), "depth": np.zeros((3000, 3000))}
+    np.savez_compressed(capture / "truth" / "views" / VIEW, **arrays)
+    with pytest.raises(CaptureError, match=r"v000\.npz: expected arrays of at most"):
+        open_truth(capture).view("v000", (5, 4))
+
+
+@pytest.mark.parametrize("key", ["views", "abrdf", "mesh", "heldout"])
+def test_what_is_no_file_or_no_path_is_said(capture, key):
+    """A pipe is not taken for a file that is missing; a list for the default."""
+    text = json.dumps({"version": 1, key: "truth/pipe"})
+    (capture / "truth" / "truth.json").write_text(text)
+    os.mkfifo(capture / "truth" / "pipe")
+    truth = open_truth(capture)
+    use = {
+        "views": lambda: truth.has_view("v000") and truth.view("v000"),
+        "abrdf": lambda: truth.samples(),
+        "mesh": lambda: truth.mesh(),
+        "heldout": lambda: open_capture(truth.heldout()),
+    }[key]
+    with pytest.raises(InputError, match=r"pipe: expected "):
+        use()
+    for value in (["a"], 3, None):
+        (capture / "truth" / "truth.json").write_text(json.dumps({"version": 1, key: value}))
+        truth = open_truth(capture)
+        with pytest.raises(CaptureError, match=rf"truth\.json: {key}: expected a path"):
+            use()
+    for value in ("a\0b", "../x", "loop/a"):
+        os.path.lexists(capture / "loop") or (capture / "loop").symlink_to("loop")
+        (capture / "truth" / "truth.json").write_text(json.dumps({"version": 1, key: value}))
+        truth = open_truth(capture)
+        with pytest.raises(InputError, match=r"expected |cannot be read"):
+            use()
+
+
+def test_a_mesh_without_all_its_faces_is_refused(capture):
+    mesh = trimesh.Trimesh(*sphere(1, subdivisions=1), process=False)
+    text = mesh.export(file_type="ply", encoding="ascii").decode().splitlines()
+    (capture / "truth" / "mesh.ply").write_text("\n".join(text[:-9]))
+    with pytest.raises(CaptureError, match=r"mesh\.ply: expected a mesh"):
+        open_truth(capture).mesh()
 
 
 @pytest.mark.parametrize(
