@@ -96,7 +96,7 @@ def check_photographs(capture: Capture) -> None:
     CaptureError
         Naming the first missing or mismatched file and how many there are.
     """
-    missing = [e.path for p in capture.photographs for e in p.exposures if not e.path.is_file()]
+    missing = [e.path for p in capture.photographs for e in p.exposures if not e.path.exists()]
     if missing:
         total = sum(len(p.exposures) for p in capture.photographs)
         raise CaptureError(
@@ -123,7 +123,7 @@ def check_environments(capture: Capture) -> None:
         Naming the light and the file.
     """
     for light in capture.lights:
-        if light.file is not None and not light.file.is_file():
+        if light.file is not None and not light.file.exists():
             raise CaptureError(
                 f"{light.file}: environment map of light {light.id!r} missing; copy it there"
             )

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ Float32 = NDArray[np.float32]
 
 FORMATS = {"exr": "openexr", "png": "png", "jpeg": "jpeg", "tiff": "tiff", "hdr": "hdr"}
 RAW_HINT = "pip install 'reflfield[raw]' to have it developed, or convert it to a 16-bit TIFF"
+# Sensors are full a little below the level that their makers state.
+SATURATED_SHARE = 0.98
 _FLOATS = ("half", "float", "double")
 _INTEGERS = ("uint8", "uint16", "uint")
 
@@ -61,6 +64,8 @@ class StoredImage:
         Whether colour was multiplied by alpha before it was stored.
     stated : callable
         Gives the colour space that the file states, or refuses it.
+    saturated : (h, w) bool or None
+        Of camera raw files, where the sensor was full: developed values do not tell.
     """
 
     colour: NDArray[Any]
@@ -68,6 +73,7 @@ class StoredImage:
     integer: bool
     premultiplied: bool
     stated: Callable[[], ColorSpace]
+    saturated: NDArray[np.bool_] | None = None
 
     @property
     def largest_code(self) -> int:
@@ -330,7 +336,19 @@ def _developed(path: Path, header: ImageHeader) -> StoredImage:
             output_color=raw_library().ColorSpace.sRGB,
             user_flip=0,  # as stored
         )
-    return StoredImage(pixels, None, True, False, lambda: ColorSpace(Encoding(LINEAR)))
+        saturated = _saturated(raw, pixels.shape[:2])
+    space = ColorSpace(Encoding(LINEAR))
+    return StoredImage(pixels, None, True, False, lambda: space, saturated)
+
+
+def _saturated(raw: Any, shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """Pixels that saturated ones have a part in, which demosaicing spreads to neighbours."""
+    values = raw.raw_image_visible
+    if values.shape != shape:
+        return None
+    full = (values >= SATURATED_SHARE * raw.white_level).astype(np.uint8)
+    spread: NDArray[np.uint8] = cv2.dilate(full, np.ones((5, 5), np.uint8))
+    return spread > 0
 
 
 def _unknown(raw: Any) -> str:

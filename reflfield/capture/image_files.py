@@ -279,6 +279,8 @@ def _measured(stored: StoredImage, reading: ImageReading) -> Bool:
     measured &= values <= np.float32(_space(stored, reading).encoding.top)
     if stored.alpha is not None:
         measured &= stored.alpha[..., None] > 0
+    if stored.saturated is not None:
+        measured &= ~stored.saturated[..., None]
     return measured
 
 

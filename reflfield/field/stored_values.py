@@ -80,9 +80,7 @@ def memory_needed(shapes: Mapping[str, tuple[int, ...]], n_bytes: Mapping[str, i
     return sum(n_bytes.values()) + decoded + max(packed, COPIES_OF_TABLE * max(table, half))
 
 
-def check_stored(
-    name: str, array: NDArray[Any], shapes: Mapping[str, tuple[int, ...]]
-) -> None:
+def check_stored(name: str, array: NDArray[Any], shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Demand values that a field can have in one of its stored arrays.
 
     Parameters

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.image_writing import write_exr, write_png
@@ -222,3 +223,28 @@ class TestSummary:
         up = np.array([0.0, 0.0, 1.0])
         gaps = [largest_gap(directions[:n], up) for n in (10, 50, 400)]
         assert gaps[0] > gaps[1] > gaps[2]
+
+
+class TestOrientation:
+    def photograph(self, folder, name, orientation):
+        picture = Image.new("RGB", (8, 6), (90, 90, 90))
+        exif = picture.getexif()
+        if orientation is not None:
+            exif[274] = orientation
+        picture.save(folder / name, exif=exif)
+
+    @pytest.mark.parametrize("orientations", [(1, 6, 1), (None, 3, None), (8, 8, 6)])
+    def test_mixture_of_one_camera_is_refused(self, tmp_path, orientations):
+        for i, orientation in enumerate(orientations):
+            self.photograph(tmp_path, f"{i}.jpg", orientation)
+        (tmp_path / "x.lp").write_text("3\n0.jpg 0 0 1\n1.jpg 0 1 0\n2.jpg 1 0 0\n")
+        with pytest.raises(CaptureError, match=r"\.jpg: expected Exif orientation"):
+            open_capture(tmp_path)
+
+    @pytest.mark.parametrize("orientation", [1, 3, 6])
+    def test_one_orientation_stays_as_stored(self, tmp_path, orientation):
+        for i in range(2):
+            self.photograph(tmp_path, f"{i}.jpg", orientation)
+        (tmp_path / "x.lp").write_text("2\n0.jpg 0 0 1\n1.jpg 0 1 0\n")
+        capture = open_capture(tmp_path)
+        assert capture.read_photograph(0).shape == (6, 8, 3)
