@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -40,6 +41,7 @@ from reflfield.steps.memory import check_memory
 from reflfield.steps.options import PipelineOptions
 from reflfield.steps.quantising import held_out
 
+log = logging.getLogger(__name__)
 # In the folder of the stages: digests of the files that were read.
 FILES_INDEX = "files.json"
 # Of the options of rendering, what no picture depends on.
@@ -359,11 +361,18 @@ def run(
                     job = settled(job)
             elif stage.wanted(job):
                 stage.run(job)
+                say_warnings(job, stage.name)
                 if job.stages.record("compression") is not None:
                     publishing.publish(job)
         publishing.publish(job)
         publishing.publish_records(job, last, whole=last == STAGES[-1])
     return job
+
+
+def say_warnings(job: Job, stage: str) -> None:
+    """Tell what a user must know of the result of a stage, computed now or before."""
+    for text in job.stages.warnings(stage):
+        log.warning("%s: %s", stage, text)
 
 
 @contextmanager

@@ -39,6 +39,9 @@ from reflfield.folders import flush_folder, folder_bytes, link_file, link_folder
 from reflfield.scheduling import Blocks, Scheduler, Tally
 
 log = logging.getLogger(__name__)
+# Among a stage's counts: what a user must know of its result, in sentences. It is said each
+# time that the result is used, and at the head of the report.
+WARNINGS = "warnings"
 RECORD = "stage.json"
 KEY = "key"
 # Folders inside a stage's: results of blocks, removed when it is complete, and stores that
@@ -276,6 +279,11 @@ class StageFolder:
     def record(self, name: str) -> StageRecord | None:
         """Record of a stage that has run; None of one that has not."""
         return next((record for record in self.records if record.name == name), None)
+
+    def warnings(self, name: str) -> list[str]:
+        """What a user must know of the result of a stage; nothing of one that has not run."""
+        record = self.record(name)
+        return [] if record is None else [str(text) for text in record.counts.get(WARNINGS, ())]
 
     def key(self, name: str) -> str:
         """Key of a stage that has run."""

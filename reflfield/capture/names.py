@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff")
 # which a letter takes up to four.
 LONGEST_NAME = 60
 LONGEST_QUOTE = 200
+# Names in one message.
+MOST_LISTED = 5
 
 
 def frame_name(path: Path) -> str:
@@ -95,6 +97,19 @@ def printable(text: str) -> str:
     ('Münze 1', 'a\\nb\\ud800')
     """
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for messages, printable, the first few of many.
+
+    Examples
+    --------
+    >>> listed([f"v{i}" for i in range(7)])
+    'v0, v1, v2, v3, v4 and 2 more'
+    """
+    more = len(names) - MOST_LISTED
+    shown = ", ".join(printable(name) for name in names[:MOST_LISTED])
+    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def quoted(value: Any) -> str:

@@ -8,38 +8,47 @@ Only a narrow band around that level is evaluated, on a grid refined from coarse
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import linprog
 from skimage.measure import marching_cubes
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.names import listed
 from reflfield.errors import GeometryError, InputError
+from reflfield.geometry.bounding_box import object_bounds
+from reflfield.geometry.carving import Grid, carve
+from reflfield.geometry.cones import View, measured_views
+from reflfield.geometry.disagreement import Contradiction, Disagreement
+from reflfield.geometry.explanations import (
+    compared_pixels,
+    explain_all,
+    explain_view,
+    overlap,
+    silhouette_of,
+)
 from reflfield.geometry.mesh import Mesh, decimate, keep_large_components, smooth
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.geometry.silhouettes import SignedDistance, signed_distance
-from reflfield.progress import track
+from reflfield.geometry.specks import specks_words, without_specks
 
 Array = NDArray[np.float64]
 
-# Allowance on the slope of the signed distance, for its error far from the outline.
-_SLOPE_ALLOWANCE = 1.1
-
-# Coarsest cells along the longest side. Fewer would only add levels, more cost time.
-_COARSE_CELLS = 12
-
 _LARGEST_RESOLUTION = 512
-_BLOCK_POINTS = 1 << 16
+# What `tolerance` is by default.
+AUTO: Literal["auto"] = "auto"
 
-# Directions in which each silhouette is bounded by a straight line when the box is sought.
-_N_TANGENTS = 16
-
-# Pixels along the longer side of the pictures in which hull and silhouettes are compared.
-_OVERLAP_PIXELS = 256
+# Share of a silhouette that the hull does not cover, a pixel and a voxel inside of the
+# outline, above which it is asked who disagrees; and of all of a silhouette, however thin.
+_SUSPICIOUS = 0.005
+_SUSPICIOUS_IF_THIN = 0.25
+# Median overlap below which a hull has nothing to do with the object.
+_COLLAPSED = 0.1
+# Median share of the silhouettes on which views must agree for a hull to be of use.
+_HOPELESS = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,10 +59,11 @@ class HullOptions:
     ----------
     resolution : int
         Voxels along the longest side of the object's bounding box, 8 .. 512.
-    tolerance : int
+    tolerance : int or "auto"
         Views that may disagree at a point without carving it away. 0 is the hull proper;
         1 or 2 suit photographs whose silhouettes miss thin parts in single views, and
-        make the hull fatter wherever that many views carry the shape alone.
+        make the hull fatter wherever that many views carry the shape alone. "auto" is 0,
+        but makes the hull without views that contradict all others, saying so.
     blur : float
         Standard deviation, voxels, of a Gaussian over the signed distance. It removes the
         saw teeth of sharp ridges, which would cost decimation and charts dearly.
@@ -69,7 +79,7 @@ class HullOptions:
     """
 
     resolution: int = 192
-    tolerance: int = 0
+    tolerance: int | Literal["auto"] = AUTO
     blur: float = 0.7
     smoothing: int = 60
     n_triangles: int = 20_000
@@ -82,9 +92,18 @@ class HullOptions:
                 f"resolution: expected 8 .. {_LARGEST_RESOLUTION} voxels, "
                 f"received {self.resolution}"
             )
+        if isinstance(self.tolerance, str) and self.tolerance != AUTO:
+            raise InputError(
+                f"tolerance: expected a number of views or 'auto', received {self.tolerance!r}"
+            )
         for name in ("tolerance", "blur", "smoothing", "n_triangles", "minimum_component"):
-            if getattr(self, name) < 0:
+            if getattr(self, name) != AUTO and getattr(self, name) < 0:
                 raise InputError(f"{name}: expected >= 0, received {getattr(self, name)}")
+        if self.bounds is not None and not np.less(*self.bounds).all():
+            raise InputError(
+                f"bounds: expected lowest < highest corner, received {self.bounds[0]}, "
+                f"{self.bounds[1]}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +125,18 @@ class HullReport:
     overlap : (n_views,) float64
         Intersection over union of the mesh's silhouette and the given one, for pixels in
         the frame. Far below 1: calibration or silhouette of that view disagrees.
+    missing : (n_views,) float64
+        Share of each silhouette that the mesh does not cover.
     leaves_frame : (n_views,) bool
         True where the object touches the border of the image.
+    contradictions : tuple of Contradiction
+        Views that contradict all others.
+    left_out : tuple of str
+        Names of those that the hull is made without.
+    specks : dict of str to int
+        Small parts of silhouettes that were removed, by the names of the views.
+    warnings : tuple of str
+        What a user must know of all this, in sentences.
     """
 
     spacing: float
@@ -117,7 +146,12 @@ class HullReport:
     area: float
     n_triangles: int
     overlap: Array
+    missing: Array
     leaves_frame: NDArray[np.bool_]
+    contradictions: tuple[Contradiction, ...] = ()
+    left_out: tuple[str, ...] = ()
+    specks: Mapping[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 def visual_hull(
@@ -158,22 +192,177 @@ def visual_hull(
     Time grows with the square of the resolution and linearly with the views.
     """
     options = options or HullOptions()
-    views = _prepare(cameras, silhouettes)
-    low, high = _object_bounds(views, options)
-    grid = _Grid.around(low, high, options.resolution)
-    volume, n_evaluated = _carve(views, grid, options.tolerance)
-    mesh = _surface(volume, grid, options)
+    views = measured_views(cameras, silhouettes)
+    views, silhouettes, specks = without_specks(views, silhouettes)
+    outcome = _agreed_hull(views, silhouettes, options)
+    grid, mesh = outcome.carved.grid, outcome.carved.mesh
+    agreement = _agreement(mesh, cameras, silhouettes)
     report = HullReport(
         spacing=grid.spacing,
         grid=grid.shape,
-        n_evaluated=n_evaluated,
+        n_evaluated=outcome.carved.n_evaluated,
         volume=mesh.volume,
         area=mesh.area,
         n_triangles=len(mesh.faces),
-        overlap=silhouette_overlap(mesh, cameras, silhouettes),
+        overlap=agreement.overlap,
+        missing=agreement.missing,
         leaves_frame=np.array([view.outline.leaves_frame for view in views]),
+        contradictions=outcome.contradictions,
+        left_out=outcome.left_out,
+        specks=specks,
+        warnings=(*specks_words(specks), *outcome.warnings),
     )
     return mesh, report
+
+
+@dataclass(frozen=True, eq=False)
+class _Carved:
+    """Hull of some views."""
+
+    mesh: Mesh
+    grid: Grid
+    n_evaluated: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """Hull of the views that agree, and what is to be said about the others."""
+
+    carved: _Carved
+    contradictions: tuple[Contradiction, ...] = ()
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def _carved(views: Sequence[View], options: HullOptions, tolerance: int) -> _Carved:
+    low, high = np.array(options.bounds or object_bounds(views, tolerance))
+    grid = Grid.around(low, high, options.resolution)
+    volume, n_evaluated = carve(views, grid, tolerance)
+    return _Carved(_surface(volume, grid, options, views), grid, n_evaluated)
+
+
+def _agreed_hull(
+    views: Sequence[View], silhouettes: Sequence[NDArray[np.floating]], options: HullOptions
+) -> _Outcome:
+    """Hull of all views, or of those that agree, as `options.tolerance` says."""
+    cameras = [view.camera for view in views]
+    tolerance = 0 if options.tolerance == AUTO else int(options.tolerance)
+    try:
+        carved, failure = _carved(views, options, tolerance), None
+    except GeometryError as error:
+        carved, failure = None, error
+    fit = None if carved is None else _agreement(carved.mesh, cameras, silhouettes)
+    if carved is not None and fit is not None and not _suspicious(views, carved, fit):
+        return _Outcome(carved)
+    disagreement = Disagreement.of(views, options.bounds)
+    if disagreement.outliers:
+        usable = carved if fit is not None and np.median(fit.overlap) > _COLLAPSED else None
+        return _outcome_with_outliers(views, silhouettes, options, disagreement, usable)
+    if carved is not None and disagreement.agree:
+        return _Outcome(carved)
+    why = explain_all(cameras, silhouettes, disagreement.covered if carved else 0.0)
+    if why is not None:
+        raise GeometryError(
+            "hull: expected silhouettes of one object, received contradicting ones: "
+            f"{why.words}, it seems: so read, they agree on {100 * why.after:.0f} % of their "
+            f"area instead of {100 * why.before:.0f} %; correct the masks or the poses"
+        )
+    words = (
+        f"{disagreement.words()}; check the calibration, and that the masks are the object's"
+    )
+    if failure is not None and (disagreement.agree or disagreement.verdict is None):
+        raise failure
+    if carved is None or disagreement.covered < _HOPELESS:
+        raise GeometryError(
+            f"hull: expected silhouettes of one object, received contradicting ones: {words}"
+        ) from failure
+    return _Outcome(carved, warnings=(words,))
+
+
+def _outcome_with_outliers(
+    views: Sequence[View],
+    silhouettes: Sequence[NDArray[np.floating]],
+    options: HullOptions,
+    disagreement: Disagreement,
+    usable: _Carved | None,
+) -> _Outcome:
+    """Hull without the views that contradict the others, or with them, as options say."""
+    kept = [view for i, view in enumerate(views) if i not in disagreement.outliers]
+    try:
+        others = _carved(kept, options, 0)
+    except GeometryError:
+        others = None
+    contradictions = tuple(_contradictions(views, silhouettes, disagreement, others))
+    words = [contradiction.words(len(kept)) for contradiction in contradictions]
+    if options.tolerance == AUTO and others is not None:
+        left_out = tuple(contradiction.view for contradiction in contradictions)
+        said = tuple(f"{text}; the hull is made without it" for text in words)
+        return _Outcome(others, contradictions, left_out, said)
+    remedy = "correct it or leave the view out"
+    if options.tolerance != AUTO:
+        remedy += ', or set hull.tolerance = "auto", which makes the hull without it'
+    if usable is None:
+        raise GeometryError(
+            "hull: expected silhouettes of one object, received contradicting ones: "
+            f"{'; '.join(words)}; {remedy}"
+        )
+    return _Outcome(usable, contradictions, (), tuple(f"{text}; {remedy}" for text in words))
+
+
+def _contradictions(
+    views: Sequence[View],
+    silhouettes: Sequence[NDArray[np.floating]],
+    disagreement: Disagreement,
+    others: _Carved | None,
+) -> Iterator[Contradiction]:
+    """What each view that contradicts the others does, and the mistake that explains it."""
+    assert disagreement.verdict is not None
+    for i in disagreement.outliers:
+        camera = views[i].camera
+        swapped = [
+            (views[j].camera.id, silhouettes[j]) for j in disagreement.outliers if j != i
+        ]
+        why = None
+        if others is not None:
+            why = explain_view(camera, silhouettes[i], others.mesh, swapped)
+        verdict = disagreement.verdict
+        yield Contradiction(
+            camera.id, float(verdict.spoilt[i]), float(verdict.uncovered[i]), why
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Agreement:
+    """How a mesh agrees with silhouettes.
+
+    Parameters
+    ----------
+    overlap : (n_views,) float64
+        Intersection over union.
+    missing : (n_views,) float64
+        Share of each silhouette that the mesh does not cover.
+    lost : list of (rows, columns) bool
+        Compared pixels of each silhouette that the mesh does not cover.
+    """
+
+    overlap: Array
+    missing: Array
+    lost: list[NDArray[np.bool_]]
+
+
+def _suspicious(views: Sequence[View], carved: _Carved, fit: _Agreement) -> bool:
+    """Whether a hull misses more of a silhouette than its voxels and blurred edges explain."""
+    if fit.missing.max() > _SUSPICIOUS_IF_THIN:
+        return True
+    centre = carved.mesh.bounds.mean(axis=0)[None]
+    for view, lost in zip(views, fit.lost, strict=True):
+        some, _, _ = compared_pixels(view.camera)
+        pixel = max(float(view.distance_and_pixel(centre)[1][0]), np.finfo(np.float64).tiny)
+        depth = view.outline.values[some, some]
+        inner = lost & (depth > 1.0 + carved.grid.spacing / pixel)
+        if inner.sum() > _SUSPICIOUS * (depth > 0.0).sum():
+            return True
+    return False
 
 
 def silhouette_overlap(
@@ -184,347 +373,27 @@ def silhouette_overlap(
     Pixels count as covered from one half on. Large images are compared on every k-th
     pixel of every k-th row, so that about 256 remain along the longer side.
     """
+    return _agreement(mesh, cameras, silhouettes).overlap
+
+
+def _agreement(
+    mesh: Mesh, cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]
+) -> _Agreement:
     scene = RayScene(mesh)
-    found = np.zeros(len(cameras))
+    overlaps, missing = np.zeros(len(cameras)), np.zeros(len(cameras))
+    lost = []
     for number, (camera, silhouette) in enumerate(zip(cameras, silhouettes, strict=True)):
-        step = max(1, round(max(camera.width, camera.height) / _OVERLAP_PIXELS))
-        covered = np.asarray(silhouette)[step // 2 :: step, step // 2 :: step] >= 0.5
-        row, col = np.mgrid[: covered.shape[0], : covered.shape[1]] * step + step // 2 + 0.5
-        pixels = np.stack([col.ravel(), row.ravel()], axis=1)
-        hit = np.isfinite(scene.pixel_depths(camera, pixels)).reshape(covered.shape)
-        found[number] = (hit & covered).sum() / max((hit | covered).sum(), 1)
-    return found
+        some, _, _ = compared_pixels(camera)
+        shown = np.asarray(silhouette)[some, some] >= 0.5
+        hit = silhouette_of(scene, camera)
+        overlaps[number] = overlap(shown, hit)
+        lost.append(shown & ~hit)
+        missing[number] = lost[-1].sum() / max(shown.sum(), 1)
+    return _Agreement(overlaps, missing, lost)
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One camera with the distance to its silhouette's outline."""
-
-    camera: Camera
-    outline: SignedDistance
-
-    def distance(self, points: Array) -> Array:
-        """Signed distance (n,) to the silhouette's cone, metres; positive inside."""
-        pixels, depth = self.camera.project(points)
-        perspective = self.camera.kind != "orthographic"
-        imaged = np.isfinite(pixels).all(axis=1) & ((depth > 0.0) | (not perspective))
-        # What a camera cannot image is empty, unless it does not see the whole object.
-        distance = np.full(len(points), np.inf if self.outline.leaves_frame else -np.inf)
-        focal = 0.5 * (self.camera.fl_x + self.camera.fl_y)
-        metres = (depth[imaged] if perspective else 1.0) / focal
-        distance[imaged] = self.outline.at(pixels[imaged]) * metres
-        return distance
-
-    @property
-    def steepest(self) -> float:
-        """Largest change of the distance per metre: 1 / cos(angle off the optical axis)."""
-        if self.camera.kind == "orthographic":
-            return 1.0
-        tangent = np.linalg.norm(_normalised(self.camera, self.outline.outline), axis=1).max()
-        return float(np.hypot(1.0, tangent))
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Cubic voxels that cover the box of the object with a border of empty ones."""
-
-    origin: Array
-    spacing: float
-    shape: tuple[int, int, int]
-    n_levels: int
-
-    @classmethod
-    def around(cls, low: Array, high: Array, resolution: int) -> _Grid:
-        spacing = float((high - low).max()) / resolution
-        n_levels = max(0, int(np.log2(resolution / _COARSE_CELLS)))
-        block = 1 << n_levels
-        # Two empty voxels on each side, then whole coarse cells.
-        blocks = np.ceil(((high - low) / spacing + 4.0) / block - 1e-9).astype(int)
-        nx, ny, nz = (int(n) * block for n in blocks)
-        origin = 0.5 * (low + high) - 0.5 * spacing * np.array([nx, ny, nz])
-        return cls(origin, spacing, (nx, ny, nz), n_levels)
-
-
-def _prepare(
-    cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]
-) -> list[_View]:
-    """Check and measure the silhouettes."""
-    if len(cameras) != len(silhouettes) or not cameras:
-        raise InputError(
-            f"silhouettes: expected one for each of {len(cameras)} cameras (at least one), "
-            f"received {len(silhouettes)}"
-        )
-    views = []
-    pairs = zip(cameras, silhouettes, strict=True)
-    for camera, silhouette in track(pairs, len(cameras), "silhouettes"):
-        if np.shape(silhouette) != (camera.height, camera.width):
-            raise InputError(
-                f"silhouette of view {camera.id!r}: expected {camera.height} rows x "
-                f"{camera.width} columns as its camera says, received {np.shape(silhouette)}"
-            )
-        outline = signed_distance(silhouette, f"silhouette of view {camera.id!r}")
-        views.append(_View(camera, outline))
-    return views
-
-
-# ---------------------------------------------------------------- bounding box
-
-
-def _object_bounds(views: list[_View], options: HullOptions) -> tuple[Array, Array]:
-    r"""Box around everything that at most `tolerance` views contradict.
-
-    Among ``tolerance + 1`` groups of views at least one has no view that contradicts
-    a point of the hull, so the boxes of the groups' own hulls together hold it.
-    """
-    if options.bounds is not None:
-        low, high = np.array(options.bounds, dtype=np.float64)
-        if not (low < high).all():
-            raise InputError(
-                f"bounds: expected lowest < highest corner, received {low}, {high}"
-            )
-        return low, high
-    origin, scale = _whereabouts(views)
-    n_groups = options.tolerance + 1
-    boxes = [_box(views[group::n_groups], origin, scale) for group in range(n_groups)]
-    found = [box for box in boxes if box is not None]
-    if not found:
-        _refuse_contradiction(views, origin, scale)
-    low = np.min([box[0] for box in found], axis=0)
-    high = np.max([box[1] for box in found], axis=0)
-    return origin + scale * low, origin + scale * high
-
-
-def _whereabouts(views: list[_View]) -> tuple[Array, float]:
-    """Rough centre and size of the object: where rays through the silhouettes' middles meet.
-
-    The box is sought in these units, in which the solver's tolerances make sense.
-    """
-    normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
-    for view in views:
-        middle = 0.5 * (view.outline.outline.min(axis=0) + view.outline.outline.max(axis=0))
-        start, towards = (ray[0] for ray in view.camera.rays(middle[None]))
-        across = np.eye(3) - np.outer(towards, towards)
-        normal_matrix += across
-        right_side += across @ start
-    solution = np.linalg.lstsq(normal_matrix, right_side, rcond=1e-9)[0]
-    centre = np.asarray(solution, dtype=np.float64)
-    sizes = [_size_at(view, centre) for view in views]
-    return centre, float(np.median(sizes))
-
-
-def _size_at(view: _View, centre: Array) -> float:
-    """Length that the silhouette's larger side has at the depth of a point, metres."""
-    extent = np.ptp(view.outline.outline, axis=0).max() + 1.0
-    if view.camera.kind == "orthographic":
-        return float(extent / view.camera.fl_x)
-    # A point in the camera itself would give size zero.
-    distance = max(np.linalg.norm(view.camera.centre - centre), np.finfo(np.float64).tiny)
-    return float(extent * distance / view.camera.fl_x)
-
-
-def _box(views: list[_View], origin: Array, scale: float) -> tuple[Array, Array] | None:
-    """Box of the intersection of the views' outlines' cones, in units of the whereabouts.
-
-    None if there is no such point.
-    """
-    planes = [_half_spaces(view, origin, scale) for view in views]
-    normals = np.concatenate([normal for normal, _ in planes])
-    offsets = np.concatenate([offset for _, offset in planes])
-    extremes = np.zeros((2, 3))
-    for axis in range(3):
-        for side, sign in enumerate((1.0, -1.0)):
-            solution = linprog(
-                sign * np.eye(3)[axis], A_ub=normals, b_ub=offsets, bounds=(None, None)
-            )
-            if solution.status == 2:
-                return None
-            if solution.status != 0:
-                _refuse_unbounded(axis)
-            extremes[side, axis] = sign * solution.fun
-    return extremes[0], extremes[1]
-
-
-def _half_spaces(view: _View, origin: Array, scale: float) -> tuple[Array, Array]:
-    """Half spaces ``normals @ x <= offsets`` that hold the silhouette's cone.
-
-    A side on which the object leaves the frame is not bounded.
-    """
-    camera = view.camera
-    outline, rim = (
-        _normalised(camera, points) for points in (view.outline.outline, view.outline.rim)
-    )
-    angles = 2.0 * np.pi * np.arange(_N_TANGENTS) / _N_TANGENTS
-    tangents = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    pixel = 1.0 / min(camera.fl_x, camera.fl_y)
-    reach = (outline @ tangents.T).max(axis=0) + pixel
-    rim_reach = (rim @ tangents.T).max(axis=0, initial=-np.inf)
-    bounded = rim_reach < reach - 2.0 * pixel
-    tangents, reach = tangents[bounded], reach[bounded]
-    rotation, shift = camera.rotation, camera.camera_from_world[:3, 3]
-    if camera.kind == "orthographic":
-        normals = tangents @ rotation[:2]
-        offsets = reach - tangents @ shift[:2]
-    else:
-        # tangent . (X, Y) <= reach * Z, and Z >= 0
-        in_camera = np.concatenate([tangents, -reach[:, None]], axis=1)
-        in_camera = np.concatenate([in_camera, [[0.0, 0.0, -1.0]]])
-        normals, offsets = in_camera @ rotation, -in_camera @ shift
-    lengths = np.linalg.norm(normals, axis=1)
-    return normals / lengths[:, None], (offsets - normals @ origin) / lengths / scale
-
-
-def _normalised(camera: Camera, pixels: Array) -> Array:
-    """Undistorted image coordinates X/Z, Y/Z (orthographic: X, Y) of pixels (n, 2)."""
-    origins, directions = camera.rays(pixels)
-    if camera.kind == "orthographic":
-        return (origins @ camera.rotation.T + camera.camera_from_world[:3, 3])[:, :2]
-    in_camera = directions @ camera.rotation.T
-    return in_camera[:, :2] / in_camera[:, 2:]
-
-
-def _refuse_unbounded(axis: int) -> None:
-    raise GeometryError(
-        f"hull: expected silhouettes that bound the object on all sides, received views that "
-        f"leave it open along world {'xyz'[axis]}; add views from other sides, give "
-        "hull.bounds, or use the base geometry 'plane' for a single view"
-    )
-
-
-def _refuse_contradiction(views: list[_View], origin: Array, scale: float) -> None:
-    """Name the first view whose cone misses the intersection of those before it."""
-    planes = [_half_spaces(view, origin, scale) for view in views]
-    for number in range(1, len(views) + 1):
-        normals, offsets = (np.concatenate(part) for part in zip(*planes[:number], strict=True))
-        solution = linprog(np.zeros(3), A_ub=normals, b_ub=offsets, bounds=(None, None))
-        if solution.status == 2:
-            _refuse_empty(views[number - 1])
-    _refuse_empty(views[-1])
-
-
-def _refuse_empty(view: _View) -> None:
-    raise GeometryError(
-        f"hull: expected silhouettes of one object, received contradicting ones: in the order "
-        f"of the views, {view.camera.id!r} is the first that leaves nothing; check its camera "
-        "and silhouette, leave the view out, or raise hull.tolerance or hull.resolution"
-    )
-
-
-# ---------------------------------------------------------------- carving
-
-
-def _carve(views: list[_View], grid: _Grid, tolerance: int) -> tuple[NDArray[np.float32], int]:
-    """Signed distances at the corners of all voxels, exact near the surface.
-
-    Returns
-    -------
-    volume : (nx + 1, ny + 1, nz + 1) float32
-        In voxels, clipped to [-2, 2]; negative on the border of the grid.
-    n_evaluated : int
-    """
-    state = np.zeros([n >> grid.n_levels for n in grid.shape], dtype=np.int8)
-    slope = _SLOPE_ALLOWANCE * max(view.steepest for view in views)
-    n_evaluated = 0
-    # Of the finest cells the corners are evaluated anyway: centres stop one level above.
-    for level in range(grid.n_levels, 0, -1):
-        undecided = np.argwhere(state == 0)
-        centres = grid.origin + (undecided + 0.5) * (grid.spacing * (1 << level))
-        band = slope * 0.5 * np.sqrt(3.0) * grid.spacing * (1 << level)
-        values = _smallest(views, centres, tolerance, band)
-        n_evaluated += len(centres)
-        if not (values > -band).any() and not (state > 0).any():
-            _refuse_empty(views[_first_emptying(views, centres, tolerance, band)])
-        decided = np.where(values > band, 1, np.where(values < -band, -1, 0))
-        state[tuple(undecided.T)] = decided
-        state = _halved(state)
-    return _corner_values(views, grid, state, tolerance, n_evaluated)
-
-
-def _halved(state: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Each cell becomes eight of the same state."""
-    for axis in range(3):
-        state = np.repeat(state, 2, axis=axis)
-    return state
-
-
-def _corner_values(
-    views: list[_View], grid: _Grid, state: NDArray[np.int8], tolerance: int, n_evaluated: int
-) -> tuple[NDArray[np.float32], int]:
-    """Evaluate the corners of undecided voxels; the others only have a sign."""
-    volume = np.where(_at_corners(state > 0), np.float32(2.0), np.float32(-2.0))
-    corners = np.argwhere(_at_corners(state == 0))
-    points = grid.origin + corners * grid.spacing
-    values = _smallest(views, points, tolerance, 2.0 * grid.spacing)
-    if not ((values > 0.0).any() or (state > 0).any()):
-        _refuse_empty(views[_first_emptying(views, points, tolerance, 0.0)])
-    in_voxels = np.clip(values / grid.spacing, -2.0, 2.0)
-    # A value of exactly zero would make triangles without area.
-    in_voxels[np.abs(in_voxels) < 1e-3] = 1e-3
-    volume[tuple(corners.T)] = in_voxels
-    # The outermost layer is empty, so that the surface closes inside the grid.
-    for axis in range(3):
-        for side in (0, -1):
-            layer = np.moveaxis(volume, axis, 0)[side]
-            np.minimum(layer, -1e-3, out=layer)
-    return volume, n_evaluated + len(corners)
-
-
-def _at_corners(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """True at the eight corners of each voxel that is True."""
-    corners = np.pad(voxels, ((0, 1),) * 3)
-    for axis in range(3):
-        moved = np.moveaxis(corners, axis, 0)
-        moved[1:] |= moved[:-1].copy()
-    return corners
-
-
-def _smallest(views: list[_View], points: Array, tolerance: int, cutoff: float) -> Array:
-    """Signed distance (n,) that only `tolerance` views undercut, metres.
-
-    Points found below ``-cutoff`` are not followed further: their value is some number
-    below ``-cutoff``.
-    """
-    values = np.zeros(len(points))
-    for begin in range(0, len(points), _BLOCK_POINTS):
-        block = slice(begin, begin + _BLOCK_POINTS)
-        values[block] = _smallest_of_block(views, points[block], tolerance, cutoff)
-    return values
-
-
-def _smallest_of_block(
-    views: list[_View], points: Array, tolerance: int, cutoff: float
-) -> Array:
-    lowest = np.full((tolerance + 1, len(points)), np.inf)
-    alive = np.arange(len(points))
-    for view in views:
-        _insert(lowest, alive, view.distance(points[alive]))
-        alive = alive[lowest[-1, alive] >= -cutoff]
-    return lowest[-1]
-
-
-def _insert(lowest: Array, columns: NDArray[np.intp], values: Array) -> None:
-    """Put new values into the sorted lists of lowest ones, ascending along axis 0."""
-    for row in lowest:
-        held = row[columns]
-        row[columns] = np.minimum(held, values)
-        values = np.maximum(held, values)
-
-
-def _first_emptying(views: list[_View], points: Array, tolerance: int, cutoff: float) -> int:
-    """Index of the view after which no point is left above ``-cutoff``."""
-    lowest = np.full((tolerance + 1, len(points)), np.inf)
-    columns = np.arange(len(points))
-    for number, view in enumerate(views):
-        _insert(lowest, columns, view.distance(points))
-        if not (lowest[-1] > -cutoff).any():
-            return number
-    return len(views) - 1
-
-
-# ---------------------------------------------------------------- surface
-
-
-def _check_inside(volume: NDArray[np.float32]) -> None:
-    """Demand that the object ends before its grid does.
+def _check_inside(volume: NDArray[np.float32], views: Sequence[View]) -> None:
+    """Demand that the object ends before its grid does; name the views that cut it off.
 
     Raises
     ------
@@ -533,14 +402,17 @@ def _check_inside(volume: NDArray[np.float32]) -> None:
     """
     ends = [volume.take(end, axis) for axis in range(3) for end in (0, -1)]
     if any((end > 0.0).any() for end in ends):
+        cut = listed([view.camera.id for view in views if view.outline.leaves_frame])
         raise GeometryError(
             "hull: expected silhouettes that bound the object on all sides, received some that "
-            "the borders of their images cut off; leave out views that do not show the whole "
-            "object, or add views from other sides"
+            f"the borders of their images cut off ({cut or 'none'}); leave out views that do "
+            "not show the whole object, or add views from other sides"
         )
 
 
-def _surface(volume: NDArray[np.float32], grid: _Grid, options: HullOptions) -> Mesh:
+def _surface(
+    volume: NDArray[np.float32], grid: Grid, options: HullOptions, views: Sequence[View]
+) -> Mesh:
     """Closed mesh of the zero level, cleaned as the options say."""
     if options.blur:
         volume = gaussian_filter(volume, options.blur, mode="nearest")
@@ -550,7 +422,7 @@ def _surface(volume: NDArray[np.float32], grid: _Grid, options: HullOptions) -> 
             "hull: expected an object thicker than a voxel, received one that smoothing "
             "removes; raise hull.resolution or lower hull.blur"
         )
-    _check_inside(volume)
+    _check_inside(volume, views)
     points, faces, _, _ = marching_cubes(volume, level=0.0, gradient_direction="ascent")
     mesh = Mesh(grid.origin + points.astype(np.float64) * grid.spacing, faces)
     mesh = keep_large_components(mesh, options.minimum_component)

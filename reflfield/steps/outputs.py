@@ -29,6 +29,7 @@ from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
 from reflfield.steps.quantising import missed_quality
 from reflfield.steps.rate_distortion import stored_points
+from reflfield.steps.surface import LEFT_OUT
 
 # Sets of frames that are compared: title and sentence.
 FRAME_TITLES = {
@@ -187,6 +188,8 @@ def problems_of(job: Job) -> Iterator[str]:
 
 def warnings_of(job: Job) -> Iterator[str]:
     """What a user should look at first."""
+    for record in job.stages.records:
+        yield from job.stages.warnings(record.name)
     yield from holding_out.left_out_words(job.capture, job.split)
     yield from filter(None, [missed_quality(job)])
     yield from problems_of(job)
@@ -208,12 +211,14 @@ def _surface_sections(
 ) -> Iterator[Section]:
     texels = job.texels
     origin = job.training.silhouette_origin(0)
+    hull = job.stages.record("hull")
     yield sections.silhouettes_section(
         _silhouette_views(job),
         origin={
             "file": "given with the capture",
             "alpha": "alpha of the photographs",
         }.get(origin, "made from the photographs"),
+        left_out=() if hull is None else hull.counts.get(LEFT_OUT, ()),
     )
     yield sections.atlas_section(
         texels.texel_of_pixel,

@@ -26,10 +26,12 @@ from reflfield.geometry.visibility import (
     light_visibility,
     view_visibility,
 )
-from reflfield.stages import plain
+from reflfield.stages import WARNINGS, plain
 from reflfield.steps.job import Job
 from reflfield.steps.options import SMALLEST_TEXTURE
 
+# Among the counts of the hull: names of the views that it is made without.
+LEFT_OUT = "views left out"
 # Views, or lights, of one block.
 DIRECTIONS_AT_ONCE = 8
 
@@ -68,18 +70,25 @@ def runs(n: int) -> list[range]:
 
 def write_hull(job: Job, folder: Path) -> dict[str, Any]:
     """Base surface: the visual hull, or the image plane of a single view."""
+    details: dict[str, Any] = {}
+    counts: dict[str, Any] = {}
     if job.is_plane:
         mesh = image_plane(job.training.cameras[0], job.view_silhouettes[0]).mesh
-        details: dict[str, Any] = {}
     else:
-        mesh, found = visual_hull(job.training.cameras, job.view_silhouettes, job.options.hull)
-        details = {k: _listed(v) for k, v in asdict(found).items()}
+        mesh, made = visual_hull(job.training.cameras, job.view_silhouettes, job.options.hull)
+        details = {k: _listed(v) for k, v in asdict(made).items()}
+        counts = {
+            "views that contradict the others": [c.view for c in made.contradictions],
+            LEFT_OUT: list(made.left_out),
+            "small parts left out": sum(made.specks.values()),
+            WARNINGS: list(made.warnings),
+        }
     scene = RayScene(mesh)
     for light in job.training.lights:
         check_light_outside(scene, light)
     write_ply(folder / "hull.ply", mesh)
     (folder / "hull.json").write_text(json.dumps(plain(details)))
-    return {"triangles": len(mesh.faces), "watertight": mesh.watertight}
+    return {"triangles": len(mesh.faces), "watertight": mesh.watertight, **counts}
 
 
 def _listed(value: Any) -> Any:

@@ -63,3 +63,16 @@ def distance_to_cones(views, points, radius=1.0):
         signed = along * np.sin(half_angle) - across * np.cos(half_angle)
         smallest = np.minimum(smallest, signed)
     return smallest
+
+
+# Balls of an object without any symmetry: centres and radii.
+LOBES = (((0, 0, 0), 0.6), ((0.55, 0.2, 0.1), 0.35), ((-0.1, 0.5, 0.45), 0.3))
+
+
+def lobed_silhouette(camera, scale=1.0):
+    """Coverage of an object of three balls, every ball scaled about the origin."""
+    parts = [
+        ball_silhouette(camera, scale * np.asarray(centre, float), scale * radius, samples=2)
+        for centre, radius in LOBES
+    ]
+    return np.max(parts, axis=0)

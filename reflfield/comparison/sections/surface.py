@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,7 +49,11 @@ class SilhouetteView:
 
 
 def silhouettes_section(
-    views: Iterable[SilhouetteView], *, origin: str = "", max_pictures: int = 12
+    views: Iterable[SilhouetteView],
+    *,
+    origin: str = "",
+    max_pictures: int = 12,
+    left_out: Collection[str] = (),
 ) -> Section:
     """Silhouettes against the hull: outlines over photographs, agreement per view.
 
@@ -61,6 +65,8 @@ def silhouettes_section(
         Where the silhouettes came from, such as "found by GrabCut".
     max_pictures : int
         Views that agree least are shown.
+    left_out : collection of str
+        Names of views that the hull is made without.
 
     Returns
     -------
@@ -87,7 +93,12 @@ def silhouettes_section(
     table = Table(
         ("view", "IoU", "missing, %", "beyond, %"),
         tuple(
-            (name, f"{iou:.4f}", f"{100 * missing:.2f}", f"{100 * beyond:.2f}")
+            (
+                _marked(name, left_out),
+                f"{iou:.4f}",
+                f"{100 * missing:.2f}",
+                f"{100 * beyond:.2f}",
+            )
             for (name, iou, missing, beyond), _ in seen
         ),
         "Agreement per view: intersection over union; area missing from the hull and area "
@@ -95,6 +106,11 @@ def silhouettes_section(
     )
     intro = f"Do cameras, silhouettes and hull fit together? Silhouettes: {origin or 'given'}."
     return Section("Silhouettes and hull", intro, (figure, table))
+
+
+def _marked(name: str, left_out: Collection[str]) -> str:
+    """Name of a view, with a remark if the hull is made without it."""
+    return f"{name} (the hull is made without it)" if name in left_out else name
 
 
 def _agreement(view: SilhouetteView) -> tuple[str, float, float, float]:

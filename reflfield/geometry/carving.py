@@ -1,0 +1,163 @@
+"""Carving: the smallest signed distance over all views, on a grid refined from coarse cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.errors import GeometryError
+from reflfield.geometry.cones import View
+
+Array = NDArray[np.float64]
+
+# Allowance on the slope of the signed distance, for its error far from the outline.
+_SLOPE_ALLOWANCE = 1.1
+
+# Coarsest cells along the longest side. Fewer would only add levels, more cost time.
+_COARSE_CELLS = 12
+
+_BLOCK_POINTS = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Cubic voxels that cover the box of the object with a border of empty ones."""
+
+    origin: Array
+    spacing: float
+    shape: tuple[int, int, int]
+    n_levels: int
+
+    @classmethod
+    def around(cls, low: Array, high: Array, resolution: int) -> Grid:
+        """Grid around a box, with so many voxels along its longest side."""
+        spacing = float((high - low).max()) / resolution
+        n_levels = max(0, int(np.log2(resolution / _COARSE_CELLS)))
+        block = 1 << n_levels
+        # Two empty voxels on each side, then whole coarse cells.
+        blocks = np.ceil(((high - low) / spacing + 4.0) / block - 1e-9).astype(int)
+        nx, ny, nz = (int(n) * block for n in blocks)
+        origin = 0.5 * (low + high) - 0.5 * spacing * np.array([nx, ny, nz])
+        return cls(origin, spacing, (nx, ny, nz), n_levels)
+
+
+def carve(views: Sequence[View], grid: Grid, tolerance: int) -> tuple[NDArray[np.float32], int]:
+    """Signed distances at the corners of all voxels, exact near the surface.
+
+    Returns
+    -------
+    volume : (nx + 1, ny + 1, nz + 1) float32
+        In voxels, clipped to [-2, 2]; negative on the border of the grid.
+    n_evaluated : int
+    """
+    state = np.zeros([n >> grid.n_levels for n in grid.shape], dtype=np.int8)
+    slope = _SLOPE_ALLOWANCE * max(view.steepest for view in views)
+    n_evaluated = 0
+    # Of the finest cells the corners are evaluated anyway: centres stop one level above.
+    for level in range(grid.n_levels, 0, -1):
+        undecided = np.argwhere(state == 0)
+        centres = grid.origin + (undecided + 0.5) * (grid.spacing * (1 << level))
+        band = slope * 0.5 * np.sqrt(3.0) * grid.spacing * (1 << level)
+        values = smallest_distance(views, centres, tolerance, band)
+        n_evaluated += len(centres)
+        if not (values > -band).any() and not (state > 0).any():
+            refuse_empty(views[first_emptying(views, centres, tolerance, band)])
+        decided = np.where(values > band, 1, np.where(values < -band, -1, 0))
+        state[tuple(undecided.T)] = decided
+        state = _halved(state)
+    return _corner_values(views, grid, state, tolerance, n_evaluated)
+
+
+def _halved(state: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Each cell becomes eight of the same state."""
+    for axis in range(3):
+        state = np.repeat(state, 2, axis=axis)
+    return state
+
+
+def _corner_values(
+    views: Sequence[View], grid: Grid, state: NDArray[np.int8], tolerance: int, n_evaluated: int
+) -> tuple[NDArray[np.float32], int]:
+    """Evaluate the corners of undecided voxels; the others only have a sign."""
+    volume = np.where(_at_corners(state > 0), np.float32(2.0), np.float32(-2.0))
+    corners = np.argwhere(_at_corners(state == 0))
+    points = grid.origin + corners * grid.spacing
+    values = smallest_distance(views, points, tolerance, 2.0 * grid.spacing)
+    if not ((values > 0.0).any() or (state > 0).any()):
+        refuse_empty(views[first_emptying(views, points, tolerance, 0.0)])
+    in_voxels = np.clip(values / grid.spacing, -2.0, 2.0)
+    # A value of exactly zero would make triangles without area.
+    in_voxels[np.abs(in_voxels) < 1e-3] = 1e-3
+    volume[tuple(corners.T)] = in_voxels
+    # The outermost layer is empty, so that the surface closes inside the grid.
+    for axis in range(3):
+        for side in (0, -1):
+            layer = np.moveaxis(volume, axis, 0)[side]
+            np.minimum(layer, -1e-3, out=layer)
+    return volume, n_evaluated + len(corners)
+
+
+def _at_corners(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """True at the eight corners of each voxel that is True."""
+    corners = np.pad(voxels, ((0, 1),) * 3)
+    for axis in range(3):
+        moved = np.moveaxis(corners, axis, 0)
+        moved[1:] |= moved[:-1].copy()
+    return corners
+
+
+def smallest_distance(
+    views: Sequence[View], points: Array, tolerance: int, cutoff: float
+) -> Array:
+    """Signed distance (n,) that only `tolerance` views undercut, metres.
+
+    Points found below ``-cutoff`` are not followed further: their value is some number
+    below ``-cutoff``.
+    """
+    values = np.zeros(len(points))
+    for begin in range(0, len(points), _BLOCK_POINTS):
+        block = slice(begin, begin + _BLOCK_POINTS)
+        values[block] = _smallest_of_block(views, points[block], tolerance, cutoff)
+    return values
+
+
+def _smallest_of_block(
+    views: Sequence[View], points: Array, tolerance: int, cutoff: float
+) -> Array:
+    lowest = np.full((tolerance + 1, len(points)), np.inf)
+    alive = np.arange(len(points))
+    for view in views:
+        _insert(lowest, alive, view.distance(points[alive]))
+        alive = alive[lowest[-1, alive] >= -cutoff]
+    return lowest[-1]
+
+
+def _insert(lowest: Array, columns: NDArray[np.intp], values: Array) -> None:
+    """Put new values into the sorted lists of lowest ones, ascending along axis 0."""
+    for row in lowest:
+        held = row[columns]
+        row[columns] = np.minimum(held, values)
+        values = np.maximum(held, values)
+
+
+def first_emptying(views: Sequence[View], points: Array, tolerance: int, cutoff: float) -> int:
+    """Index of the view after which no point is left above ``-cutoff``."""
+    lowest = np.full((tolerance + 1, len(points)), np.inf)
+    columns = np.arange(len(points))
+    for number, view in enumerate(views):
+        _insert(lowest, columns, view.distance(points))
+        if not (lowest[-1] > -cutoff).any():
+            return number
+    return len(views) - 1
+
+
+def refuse_empty(view: View) -> None:
+    """Name the first view, in their order, that leaves nothing."""
+    raise GeometryError(
+        f"hull: expected silhouettes of one object, received contradicting ones: in the order "
+        f"of the views, {view.camera.id!r} is the first that leaves nothing; check its camera "
+        "and silhouette, leave the view out, or raise hull.tolerance or hull.resolution"
+    )
