@@ -153,7 +153,7 @@ def test_one_view_or_one_light_must_simply_work(one, relief, scene):
 
 
 @pytest.mark.stability
-def test_texels_that_determine_nothing_get_the_base_frame_and_no_score(relief):
+def test_texels_that_determine_nothing_get_the_base_frame_and_no_score(relief, rounding):
     _, directions, samples = relief
     hard = samples[:6].copy()
     hard[0] = np.nan
@@ -167,7 +167,11 @@ def test_texels_that_determine_nothing_get_the_base_frame_and_no_score(relief):
     for texel in (0, 1):
         assert np.array_equal(result.local_from_base[texel], np.eye(3))
         assert result.score[texel] == 0.0
-    np.testing.assert_allclose(result.local_from_base[4], result.local_from_base[5], atol=1e-9)
+    # Equal samples in other rows of a product differ in its last bits, and the search is
+    # done in float32.
+    np.testing.assert_allclose(
+        result.local_from_base[4], result.local_from_base[5], atol=rounding(np.float32)
+    )
 
 
 @pytest.mark.stability
