@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from reflfield.capture.consistency import check_single_lights
 from reflfield.capture.model import Capture
 from reflfield.code_digests import code_digest
 from reflfield.config import HoldOut, Resources
@@ -352,6 +353,7 @@ def run(
     )
     if job.resources.store is not None:
         check_place(job.resources.store, capture=capture.root, out=out)
+    check_single_lights(capture)
     check_memory(job)
     choices.check_choices(job)
     with only_run(job.stages.root), telling_where_the_field_is(job):

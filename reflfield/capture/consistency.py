@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reflfield.capture.image_files import image_orientation, image_size
+from reflfield.capture.lights import ENVIRONMENT, GROUP
 from reflfield.capture.model import Capture, check_matches
 from reflfield.errors import CaptureError
 
@@ -64,6 +65,26 @@ def check_lights(capture: Capture) -> None:
                 f"{capture.description}: light {capture.lights[photograph.light].id!r} of "
                 f"photograph {photograph.name!r}: expected an intensity above 0 in some "
                 "channel, received 0 in all; correct it, or leave out photographs without light"
+            )
+
+
+def check_single_lights(capture: Capture) -> None:
+    """Demand photographs under one light each, as a field is made of.
+
+    Raises
+    ------
+    CaptureError
+        Naming the first photograph under an environment map or several lights at once.
+    """
+    for photograph in capture.photographs:
+        light = capture.lights[photograph.light]
+        if light.kind in (ENVIRONMENT, GROUP):
+            under = "an environment map" if light.kind == ENVIRONMENT else "several lights"
+            raise CaptureError(
+                f"{capture.description}: photograph {photograph.name!r}: expected one point, "
+                f"directional, spot or unknown light, received {under} (light {light.id!r}); a "
+                "field is not made of such photographs: leave them out, and compare the field "
+                "with them afterwards"
             )
 
 

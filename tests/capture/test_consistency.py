@@ -8,6 +8,7 @@ import pytest
 
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError
+from reflfield.pipeline import run
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
 
@@ -53,6 +54,20 @@ def test_all_lights_dark(opened):
 
     with pytest.raises(CaptureError, match=r"capture\.json: light 'l000'.*intensity above 0"):
         opened(darken)
+
+
+def test_a_field_is_not_made_of_photographs_under_an_environment(opened):
+    def add_sky(document):
+        document["lights"][0] = {
+            "id": "l000",
+            "type": "environment",
+            "file": "silhouettes/v000.png",
+        }
+
+    capture = opened(add_sky)
+    with pytest.raises(CaptureError, match=r"'v000_l000': expected one point.*'l000'"):
+        run(capture, capture.root / "out")
+    assert not (capture.root / "out").exists()
 
 
 def test_one_channel_of_light_is_light(opened):
