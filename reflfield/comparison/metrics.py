@@ -18,13 +18,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import flip_evaluator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion
-from skimage.metrics import structural_similarity
 
-from reflfield.comparison.tonemapping import display, luminance
+from reflfield.comparison.image_errors import (
+    PIXELS_PER_DEGREE,
+    PSNR_CAP_DB,
+    flip_map,
+    psnr_of_mean_square,
+    ssim_map,
+    strips,
+)
+from reflfield.comparison.tonemapping import ThinnedValues, display, luminance
 from reflfield.errors import InputError, ShapeError
 
 Image = NDArray[np.float64]
@@ -32,13 +38,6 @@ Image = NDArray[np.float64]
 COVERAGE_OF_OBJECT = 0.5
 EROSION_PX = 2
 EXPOSURE_PERCENTILE = 99.5
-# A 0.7 m wide screen of 3840 pixels seen from 0.7 m, FLIP's own default.
-PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
-# Equal pictures have no error and an infinite PSNR, which JSON cannot hold and
-# no mean survives. 100 dB is an error of 1e-5 of the peak, below half floats.
-PSNR_CAP_DB = 100.0
-# skimage's default window; smaller only for pictures that it does not fit into.
-SSIM_WINDOW_PX = 7
 
 # What is said of a frame, in the order of ``metrics.json``.
 FRAME_KEYS = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels", "n_excluded",
@@ -267,7 +266,7 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
 
     Notes
     -----
-    Exact: keeps the luminance of all object pixels, eight bytes each.
+    Exact up to `ThinnedValues.most` object pixels, of an even part of them beyond.
 
     Examples
     --------
@@ -275,15 +274,15 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     >>> round(common_exposure([(grey, np.ones((9, 9)))]), 6)
     4.0
     """
-    kept = [
-        luminance(np.asarray(photograph)[_counted(silhouette)])
-        for photograph, silhouette in pictures
-    ]
-    values = np.concatenate(kept) if kept else np.zeros(0)
+    kept, n_frames = ThinnedValues(), 0
+    for photograph, silhouette in pictures:
+        n_frames += 1
+        kept.add(luminance(np.asarray(photograph)[_counted(silhouette)]))
+    values = kept.values
     if values.size == 0:
         raise NothingToMeasure(
             "frames: expected at least one object pixel to set the exposure from, received "
-            f"none in {len(kept)} frames; check the silhouettes"
+            f"none in {n_frames} frames; check the silhouettes"
         )
     white = float(np.percentile(values, EXPOSURE_PERCENTILE))
     return 1.0 / white if white > 0.0 else math.nan
@@ -377,19 +376,51 @@ def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
             f"frame {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, eroded "
             "by 2 pixels), received none; leave the frame out or check its silhouette"
         )
-    photograph, relit = without_backdrop(pair)
-    shown_photograph, shown_relit = display(photograph, exposure), display(relit, exposure)
+    sums = _sums(pair, counted, exposure)
+    n = int(counted.sum())
     return FrameMetrics(
         name=pair.name,
-        psnr_ldr=psnr(shown_photograph[counted], shown_relit[counted]),
-        psnr_hdr=psnr(exposure * photograph[counted], exposure * relit[counted]),
-        ssim=float(ssim_map(shown_photograph, shown_relit)[counted].mean()),
-        flip=float(flip_map(shown_photograph, shown_relit)[counted].mean(dtype=np.float64)),
-        n_pixels=int(counted.sum()),
-        colour_ratio=_colour_ratio(photograph[counted], relit[counted]),
+        psnr_ldr=psnr_of_mean_square(sums["ldr"] / (3 * n)),
+        psnr_hdr=psnr_of_mean_square(sums["hdr"] / (3 * n)),
+        ssim=sums["ssim"] / n,
+        flip=sums["flip"] / n,
+        n_pixels=n,
+        colour_ratio=_colour_ratio(*sums["colours"]),
         n_excluded=int((object_pixels(pair.silhouette) & ~counted).sum()),
         silhouette_from=pair.silhouette_from,
     )
+
+
+def _sums(pair: FramePair, counted: NDArray[np.bool_], exposure: float) -> dict[str, Any]:
+    """Sums over the pixels that count: squared errors, SSIM, FLIP, and both pictures."""
+    sums: dict[str, Any] = dict.fromkeys(("ldr", "hdr", "ssim", "flip"), 0.0)
+    sums["colours"] = np.zeros((2, 3))
+    for own, wide, inner in strips(*counted.shape):
+        here = counted[own]
+        if not here.any():
+            continue
+        pictures = without_backdrop(pair, wide)
+        shown = [display(picture, exposure) for picture in pictures]
+        radiance = [picture[inner][here] for picture in pictures]
+        first, second = (picture[inner][here] for picture in shown)
+        sums["ldr"] += float(np.sum((second - first) ** 2))
+        first, second = (exposure * values for values in radiance)
+        sums["hdr"] += float(np.sum((second - first) ** 2))
+        sums["ssim"] += float(ssim_map(*shown)[inner][here].sum())
+        sums["flip"] += float(flip_map(*shown)[inner][here].sum(dtype=np.float64))
+        sums["colours"] += [values.sum(axis=0) for values in radiance]
+    return sums
+
+
+def flip_errors(pair: FramePair, exposure: float) -> NDArray[np.float32]:
+    """FLIP error of each pixel of a frame, (h, w) float32; 0 where the object is not near."""
+    covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
+    errors = np.zeros(covered.shape, np.float32)
+    for own, wide, inner in strips(*covered.shape):
+        if covered[wide].any():
+            shown = [display(picture, exposure) for picture in without_backdrop(pair, wide)]
+            errors[own] = flip_map(*shown)[inner]
+    return errors
 
 
 def check_pair(pair: FramePair) -> None:
@@ -415,97 +446,21 @@ def check_pair(pair: FramePair) -> None:
         _check_finite(pair.name, what, image, covered)
 
 
-def without_backdrop(pair: FramePair) -> tuple[Image, Image]:
-    """Photograph and relit picture as float64, black where coverage < 0.5.
+def without_backdrop(pair: FramePair, rows: slice = slice(None)) -> tuple[Image, Image]:
+    """Photograph and relit picture (some rows) as float64, black where coverage < 0.5.
 
     SSIM and FLIP look at neighbourhoods; a backdrop that the field cannot know
     must not enter them from outside the silhouette. Nor must a saturated highlight: where
     pixels are excluded, the relit picture is equal to the photograph.
     """
-    covered = (np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT)[..., None]
+    covered = (np.asarray(pair.silhouette)[rows] >= COVERAGE_OF_OBJECT)[..., None]
     photograph, relit = (
-        np.where(covered, np.asarray(image, dtype=np.float64), 0.0)
+        np.where(covered, np.asarray(np.asarray(image)[rows], dtype=np.float64), 0.0)
         for image in (pair.photograph, pair.relit)
     )
     if pair.excluded is not None:
-        relit = np.where(pair.excluded[..., None], photograph, relit)
+        relit = np.where(pair.excluded[rows][..., None], photograph, relit)
     return photograph, relit
-
-
-def psnr(reference: ArrayLike, test: ArrayLike) -> float:
-    r"""Peak signal-to-noise ratio for peak 1, :math:`-10 \log_{10} \mathrm{MSE}`, dB.
-
-    At most `PSNR_CAP_DB`, which equal pictures get.
-
-    Examples
-    --------
-    >>> psnr([0.5, 0.5], [0.6, 0.4])
-    20.0
-    >>> psnr([0.5], [0.5])
-    100.0
-    """
-    difference = np.asarray(test, dtype=np.float64) - np.asarray(reference, dtype=np.float64)
-    mean_square = float(np.mean(difference**2))
-    if mean_square <= 10.0 ** (-PSNR_CAP_DB / 10.0):
-        return PSNR_CAP_DB
-    return -10.0 * math.log10(mean_square)
-
-
-def ssim_map(reference: Image, test: Image) -> Image:
-    """Structural similarity around each pixel, mean over channels.
-
-    Parameters
-    ----------
-    reference, test : (h, w, 3) float64
-        Displayed values in [0, 1].
-
-    Returns
-    -------
-    (h, w) float64
-        1 where equal.
-
-    References
-    ----------
-    .. [1] Z. Wang, A. Bovik, H. Sheikh, E. Simoncelli, "Image quality
-       assessment: from error visibility to structural similarity", IEEE
-       Transactions on Image Processing 13(4), 2004.
-    """
-    # At least 5: smaller pictures have no object pixels.
-    fitting = min(SSIM_WINDOW_PX, *reference.shape[:2])
-    window = fitting if fitting % 2 else fitting - 1
-    _, similarity = structural_similarity(
-        reference, test, win_size=window, data_range=1.0, channel_axis=-1, full=True
-    )
-    return np.asarray(similarity, dtype=np.float64).mean(axis=-1)
-
-
-def flip_map(reference: Image, test: Image) -> NDArray[np.float32]:
-    """LDR-FLIP error of each pixel, at `PIXELS_PER_DEGREE`.
-
-    Parameters
-    ----------
-    reference, test : (h, w, 3) float64
-        Displayed (sRGB encoded) values in [0, 1].
-
-    Returns
-    -------
-    (h, w) float32
-        0 (not distinguishable) to 1.
-
-    References
-    ----------
-    .. [1] P. Andersson et al., "FLIP: A Difference Evaluator for Alternating
-       Images", Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020.
-    """
-    error, _, _ = flip_evaluator.evaluate(
-        np.ascontiguousarray(reference, dtype=np.float32),
-        np.ascontiguousarray(test, dtype=np.float32),
-        "LDR",
-        applyMagma=False,
-        computeMeanError=False,
-        parameters={"ppd": PIXELS_PER_DEGREE},
-    )
-    return np.asarray(error, dtype=np.float32)[..., 0]
 
 
 def _checked(pairs: Iterable[FramePair]) -> Iterator[FramePair]:
@@ -528,11 +483,12 @@ def _check_finite(
 
 
 def _colour_ratio(
-    photograph: Image, relit: Image
+    photograph: NDArray[np.float64], relit: NDArray[np.float64]
 ) -> tuple[float | None, float | None, float | None]:
-    sums = photograph.sum(axis=0), relit.sum(axis=0)
+    """Of the sums (3,) of both pictures."""
     red, green, blue = (
-        float(got / want) if want > 0.0 else None for want, got in zip(*sums, strict=True)
+        float(got / want) if want > 0.0 else None
+        for want, got in zip(photograph, relit, strict=True)
     )
     return red, green, blue
 

@@ -22,6 +22,8 @@ from reflfield.errors import InputError
 Encoded = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
+# Rows of a photograph that are shown in colour together.
+ROWS_AT_ONCE = 64
 # Neutral grey: neither the dark nor the light end of any colour map used here.
 NOTHING: Colour = (128, 128, 128)
 SILHOUETTE_COLOUR: Colour = (0, 200, 255)
@@ -49,10 +51,15 @@ def tonemapped(image: ArrayLike, exposure: float) -> Encoded:
     >>> tonemapped(np.full((1, 1, 3), 0.108), exposure=2.0)[0, 0].tolist()
     [128, 128, 128]
     """
-    linear = np.asarray(image, dtype=np.float64)
-    finite = np.isfinite(linear).all(axis=-1, keepdims=True)
-    shown = display(np.where(finite, linear, 0.0), exposure)
-    return np.where(finite, _eight_bit(shown), np.array(NOTHING, dtype=np.uint8))
+    linear = np.asarray(image)
+    picture = np.full(linear.shape, NOTHING, np.uint8)
+    # Some rows at a time: double precision of a photograph takes ten times its memory.
+    for first in range(0, len(linear), ROWS_AT_ONCE):
+        rows = np.asarray(linear[first : first + ROWS_AT_ONCE], np.float64)
+        finite = np.isfinite(rows).all(axis=-1, keepdims=True)
+        shown = _eight_bit(display(np.where(finite, rows, 0.0), exposure))
+        np.copyto(picture[first : first + ROWS_AT_ONCE], shown, where=finite)
+    return picture
 
 
 def exposure_for(image: ArrayLike, shown: ArrayLike, percentile: float = 99.5) -> float:
@@ -329,6 +336,38 @@ def fitted(picture: Encoded, max_side: int) -> Encoded:
         return picture
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(PillowImage.fromarray(picture).resize(size, PillowImage.Resampling.BOX))
+
+
+def block_means(values: ArrayLike, max_side: int) -> NDArray[np.float32]:
+    """Means over square blocks, so that the longer side is at most `max_side`.
+
+    Parameters
+    ----------
+    values : (h, w) array_like
+        What is not finite does not count.
+    max_side : int
+
+    Returns
+    -------
+    (rows, columns) float32
+        NaN where nothing counts.
+
+    Examples
+    --------
+    >>> block_means([[1, 3, 5], [np.nan, 8, np.nan]], max_side=2)
+    array([[4., 5.]], dtype=float32)
+    """
+    numbers = np.asarray(values, np.float32)
+    step = -(-max(numbers.shape) // max_side)
+    if step <= 1:
+        return numbers
+    finite = np.isfinite(numbers)
+    starts = [np.arange(0, n, step) for n in numbers.shape]
+    total, count = (
+        np.add.reduceat(np.add.reduceat(array, starts[0], axis=0), starts[1], axis=1)
+        for array in (np.where(finite, numbers, 0), finite.astype(np.float32))
+    )
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
 def enlarged(picture: NDArray[Any], factor: int) -> NDArray[Any]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.encoding import encode_srgb
-from reflfield.comparison.metrics import psnr
+from reflfield.comparison.image_errors import psnr
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.model import ReflectanceField

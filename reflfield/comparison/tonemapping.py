@@ -57,3 +57,38 @@ def display(image: ArrayLike, exposure: float) -> NDArray[np.float64]:
     """
     exposed = np.asarray(image, dtype=np.float64) * exposure
     return np.asarray(encode_srgb(exposed), dtype=np.float64)
+
+
+class ThinnedValues:
+    """Numbers for a percentile: all of them, or every second, fourth, ... if they are many.
+
+    Parameters
+    ----------
+    most : int
+        Numbers kept at most.
+
+    Examples
+    --------
+    >>> kept = ThinnedValues(most=4)
+    >>> for first in (0, 5):
+    ...     kept.add(np.arange(first, first + 5.0))
+    >>> kept.values
+    array([0., 4., 8.])
+    """
+
+    def __init__(self, most: int = 1 << 23) -> None:
+        self.most = most
+        self.values = np.zeros(0)
+        self._step = 1
+        self._next = 0  # of the numbers to come, the first that is kept
+
+    def add(self, values: NDArray[np.floating]) -> None:
+        """Add some more numbers."""
+        chosen = np.asarray(values, np.float64)[self._next :: self._step]
+        self._next += len(chosen) * self._step - len(values)
+        self.values = np.concatenate([self.values, chosen])
+        while len(self.values) > self.most:
+            # The next number of the thinner set, seen from the end of those added.
+            self._next += self._step * (len(self.values) % 2)
+            self.values = self.values[::2]
+            self._step *= 2

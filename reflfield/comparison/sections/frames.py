@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.comparison import pictures, plots
+from reflfield.comparison.image_errors import PSNR_CAP_DB
 from reflfield.comparison.metrics import (
     COVERAGE_OF_OBJECT,
-    PSNR_CAP_DB,
     Comparison,
     FrameMetrics,
     FramePair,
-    flip_map,
-    without_backdrop,
+    flip_errors,
     worst_to_best,
 )
 from reflfield.comparison.report import (
@@ -31,7 +30,6 @@ from reflfield.comparison.report import (
     Table,
     encode_picture,
 )
-from reflfield.comparison.tonemapping import display
 from reflfield.errors import InputError
 
 ROW_PX = 480
@@ -90,12 +88,12 @@ def frames_section(
 
 @dataclass(frozen=True, eq=False)
 class ComparedRow:
-    """One frame for the page: pictures, metrics, and (h, w) FLIP errors."""
+    """One frame for the page: pictures, metrics, and FLIP errors, means over some pixels."""
 
     metrics: FrameMetrics
     photograph: Picture
     relit: Picture
-    error: NDArray[np.float64]
+    error: NDArray[np.floating]
 
 
 def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> ComparedRow:
@@ -110,12 +108,11 @@ def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> Com
         encode_picture(pictures.fitted(pictures.tonemapped(image[box], exposure), ROW_PX))
         for image in (np.asarray(pair.photograph), np.asarray(pair.relit))
     )
-    error = flip_map(*(display(image, exposure) for image in without_backdrop(pair)))
-    shown = np.where(pair.counted, error, np.nan)[box]
-    return ComparedRow(metrics, photograph, relit, shown)
+    errors = np.where(pair.counted, flip_errors(pair, exposure), np.float32(np.nan))[box]
+    return ComparedRow(metrics, photograph, relit, pictures.block_means(errors, 2 * ROW_PX))
 
 
-def flip_scale(errors: Sequence[NDArray[np.float64]]) -> float:
+def flip_scale(errors: Sequence[NDArray[np.floating]]) -> float:
     """End of the colour scale that shows nearly all of the errors."""
     tops = [float(np.nanpercentile(error, 99)) for error in errors]
     top = max(tops, default=1.0)
