@@ -12,7 +12,6 @@ from __future__ import annotations
 import base64
 import io
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from PIL import Image as PillowImage
 
 from reflfield.comparison.pictures import colour_stops
 from reflfield.errors import ShapeError
+from reflfield.files import replacing
 
 # Texts, counts, measures, or nothing. Numbers are aligned right.
 Cell = str | int | float | bool | None
@@ -249,12 +249,8 @@ def write_report(path: Path | str, content: ReportContent) -> None:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        unfinished.write_text(render_report(content), encoding="utf-8")
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with replacing(path) as partial:
+        partial.write_text(render_report(content), encoding="utf-8")
 
 
 def render_report(content: ReportContent) -> str:

@@ -13,8 +13,9 @@ from PIL import Image
 
 from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.files import replacing
 from reflfield.geometry.atlas import Atlas
-from reflfield.geometry.mesh import unit_or_zero, write_atomically
+from reflfield.geometry.mesh import unit_or_zero
 from reflfield.geometry.texels import frames, texture_axes
 
 _FLOAT, _UINT = 5126, 5125
@@ -69,7 +70,10 @@ def write_glb(
     indices = buffer.add(atlas.faces.astype("<u4").ravel(), "SCALAR", target=_INDICES)
     image = buffer.add_bytes(_png(base_colour))
     document = _document(name, attributes, indices, image, origin) | buffer.description()
-    write_atomically(path, _glb(document, bytes(buffer.content)))
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as partial:
+        partial.write_bytes(_glb(document, bytes(buffer.content)))
 
 
 def far_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from reflfield.checks import check_shape
 from reflfield.errors import GeometryError, InputError
+from reflfield.files import replacing
 from reflfield.geometry.open3d_library import open3d
 
 Array = NDArray[np.float64]
@@ -377,7 +376,10 @@ def write_ply(path: Path | str, mesh: Mesh) -> None:
             "end_header\n",
         ]
     )
-    write_atomically(path, header.encode("ascii") + vertices.tobytes() + faces.tobytes())
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as partial:
+        partial.write_bytes(header.encode("ascii") + vertices.tobytes() + faces.tobytes())
 
 
 def read_ply(path: Path | str) -> Mesh:
@@ -399,26 +401,3 @@ def read_ply(path: Path | str) -> Mesh:
     if not len(faces):
         raise InputError(f"{path}: expected triangles, received none; write the mesh again")
     return Mesh(vertices, faces)
-
-
-def write_atomically(path: Path | str, content: bytes) -> None:
-    """Write a file that is either complete under its name or not there.
-
-    Parameters
-    ----------
-    path : Path or str
-        Parent folders are made.
-    content : bytes
-    """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-        # mkstemp makes private files; results are for everybody who may read the folder.
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
