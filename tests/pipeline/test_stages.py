@@ -221,3 +221,22 @@ def test_computed_again_it_is_taken_over_only_if_that_was_just_done(other, tmp_p
     made = own.run("sum", refused, options=OPTIONS)
     assert (made / "sum.txt").samefile(fresh.root / "sum" / "sum.txt")
     assert not own.records[0].reused
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+        OSError("1000 requested and 0 written"),  # in NumPy's words
+    ],
+    ids=["system", "numpy"],
+)
+def test_a_full_disk_is_said_with_the_folder_that_it_holds(tmp_path, failure):
+    def full(folder):
+        raise failure
+
+    with pytest.raises(OSError, match="No space left on device") as raised:
+        StageFolder(tmp_path).run("sum", full, options=OPTIONS)
+    assert raised.value.filename == str(tmp_path / "sum.partial")
+    assert raised.value.errno == errno.ENOSPC
+    assert not (tmp_path / "sum.partial").exists()
