@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,13 +17,21 @@ from numpy.typing import NDArray
 
 from reflfield.checks import check_shape
 from reflfield.children import tied
-from reflfield.errors import GeometryError, InputError
+from reflfield.errors import GeometryError, InputError, ReflfieldError
 from reflfield.geometry.box_charts import box_charts
 from reflfield.geometry.mesh import Mesh
 
 Array = NDArray[np.float64]
 
 _METHODS = ("xatlas", "boxes")
+
+# Triangles that xatlas unwraps in at most a few minutes of one core, however rough they are:
+# 20,000 take 2 to 13 s, 80,000 smooth ones 23 s.
+MOST_FACES = 100_000
+
+WORKER = "reflfield.geometry.xatlas_worker"
+# Signals by which a process ends that has gone wrong by itself.
+CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL)
 
 
 @dataclass(frozen=True)
@@ -37,7 +46,9 @@ class AtlasOptions:
     padding : int
         Empty texels between charts.
     time_limit_s : float
-        xatlas is stopped after this time and the simpler charts are used.
+        A guard against a hang: xatlas is stopped after this time, and that is an error. What
+        it may take is bounded otherwise (`MOST_FACES`), so that a busy machine makes the same
+        atlas.
     max_cost : float
         Growth of xatlas' charts: higher gives fewer, more distorted charts.
     method : {"xatlas", "boxes"}
@@ -46,7 +57,7 @@ class AtlasOptions:
 
     resolution: int = 256
     padding: int = 2
-    time_limit_s: float = 120.0
+    time_limit_s: float = 3600.0
     max_cost: float = 2.0
     method: str = "xatlas"
 
@@ -157,17 +168,35 @@ class AtlasWarning(UserWarning):
     """The atlas was made by the simpler method."""
 
 
+class UnwrappingError(ReflfieldError):
+    """xatlas cannot unwrap a mesh, on no machine: simpler charts can."""
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltAtlas:
+    """An atlas, and how it was made.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    method : {"xatlas", "boxes"}
+    reason : str
+        Why the method is not the one asked for; empty if it is.
+    """
+
+    atlas: Atlas
+    method: str
+    reason: str = ""
+
+
 def build_atlas(mesh: Mesh, options: AtlasOptions | None = None) -> Atlas:
     """Cut a mesh into charts and pack them into a square texture.
 
-    xatlas runs in a process of its own under a time limit. If it fails or takes too
-    long, the simple charts of `box_charts` are used and a warning says so.
+    As `built_atlas`; where the charts are not those asked for, an `AtlasWarning` says why.
 
     Parameters
     ----------
     mesh : Mesh
-        About 20,000 smooth triangles unwrap in a few seconds into some tens of charts;
-        raw marching cubes would give thousands.
     options : AtlasOptions, optional
 
     Returns
@@ -178,27 +207,66 @@ def build_atlas(mesh: Mesh, options: AtlasOptions | None = None) -> Atlas:
     Raises
     ------
     GeometryError
-        If the mesh has no area, or its charts do not fit into the texture at all.
+        As `built_atlas`.
+    """
+    built = built_atlas(mesh, options)
+    if built.reason:
+        warnings.warn(fallback_words(built.reason), AtlasWarning, stacklevel=2)
+    return built.atlas
+
+
+def fallback_words(reason: str) -> str:
+    """Sentence on why an atlas is made of box charts, without its end."""
+    return f"{reason}; the atlas is made of box charts, which have more seams"
+
+
+def built_atlas(mesh: Mesh, options: AtlasOptions | None = None) -> BuiltAtlas:
+    """Cut a mesh into charts and pack them into a square texture; say how.
+
+    xatlas runs in a process of its own. Meshes that are too much work for it (more than
+    `MOST_FACES` triangles), that crash it or whose charts do not fit get the simple charts of
+    `box_charts`. All of this depends on the mesh alone: how fast or busy the machine is, and
+    how many cores it has, changes nothing.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        About 20,000 smooth triangles unwrap in a few seconds into some tens of charts;
+        raw marching cubes would give thousands.
+    options : AtlasOptions, optional
+
+    Returns
+    -------
+    BuiltAtlas
+
+    Raises
+    ------
+    GeometryError
+        If the mesh has no area, its charts do not fit into the texture at all, or xatlas
+        does not answer for a reason that lies in the machine (time, memory, installation).
     """
     options = options or AtlasOptions()
     if not mesh.area > 0.0:
         raise GeometryError("mesh: expected a surface with area, received none")
+    reason = ""
     if options.method == "xatlas":
         try:
-            return _xatlas_atlas(mesh, options)
-        except (subprocess.SubprocessError, OSError, ValueError) as error:
-            warnings.warn(
-                f"xatlas did not answer ({error}); the atlas is made of box charts",
-                AtlasWarning,
-                stacklevel=2,
-            )
+            return BuiltAtlas(_xatlas_atlas(mesh, options), "xatlas")
+        except UnwrappingError as error:
+            reason = str(error)
     charts = box_charts(mesh, options.resolution, options.padding)
-    return _assembled(
+    atlas = _assembled(
         mesh, charts.source_vertex, charts.faces, charts.chart, charts.uv, options
     )
+    return BuiltAtlas(atlas, "boxes", reason)
 
 
 def _xatlas_atlas(mesh: Mesh, options: AtlasOptions) -> Atlas:
+    if len(mesh.faces) > MOST_FACES:
+        raise UnwrappingError(
+            f"xatlas is not asked to unwrap more than {MOST_FACES} triangles, and the mesh has "
+            f"{len(mesh.faces)} (hull.n_triangles lowers that)"
+        )
     # Area 1 around the origin: xatlas works in single precision with fixed tolerances.
     unit = (mesh.vertices - mesh.bounds.mean(axis=0)) / np.sqrt(mesh.area)
     job = {
@@ -210,10 +278,12 @@ def _xatlas_atlas(mesh: Mesh, options: AtlasOptions) -> Atlas:
         "max_cost": np.array(options.max_cost),
     }
     made = _run_worker(job, options.time_limit_s)
+    if "refused" in made:
+        raise UnwrappingError(f"xatlas could not unwrap the mesh: {made['refused']}")
     faces, chart = made["faces"].astype(np.int64), made["chart"].astype(np.int64)
     source = made["source_vertex"].astype(np.int64)
     if not np.array_equal(source[faces], mesh.faces):
-        raise ValueError("xatlas returned other triangles")
+        raise UnwrappingError("xatlas returned other triangles than it was given")
     uv = made["uv"].astype(np.float64) / options.resolution
     uncharted = chart < 0
     # Faces without area belong to no chart: they become a point of the first one.
@@ -232,20 +302,53 @@ def _run_worker(
     with tempfile.TemporaryDirectory(prefix="reflfield-") as folder:
         source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
         np.savez(source, allow_pickle=False, **job)
-        worker = "reflfield.geometry.xatlas_worker"
-        done = subprocess.run(
-            tied([sys.executable, "-m", worker, str(source), str(target)]),
+        command = tied([sys.executable, "-m", WORKER, str(source), str(target)])
+        done = _answer(command, environment, time_limit_s, len(job["faces"]))
+        _check_answer(done.returncode, done.stderr)
+        with np.load(target, allow_pickle=False) as made:
+            return dict(made)
+
+
+def _answer(
+    command: list[str], environment: dict[str, str], time_limit_s: float, n_faces: int
+) -> subprocess.CompletedProcess[str]:
+    """Outcome of the worker's process, which is stopped if it hangs."""
+    try:
+        return subprocess.run(
+            command,
             env=environment,
             timeout=time_limit_s,
             capture_output=True,
             text=True,
             check=False,
         )
-        if done.returncode != 0:
-            reason = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
-            raise ValueError(reason[0])
-        with np.load(target, allow_pickle=False) as made:
-            return dict(made)
+    except subprocess.TimeoutExpired:
+        raise GeometryError(
+            f"atlas: expected xatlas to unwrap {n_faces} triangles within "
+            f"{time_limit_s:g} s, received no answer; raise atlas.time_limit_s if the machine "
+            'is busy, lower hull.n_triangles, or set atlas.method = "boxes"'
+        ) from None
+
+
+def _check_answer(status: int, said: str) -> None:
+    """Refuse what the worker failed at, by whether that is the mesh's doing.
+
+    Raises
+    ------
+    UnwrappingError
+        If xatlas crashed: it would again.
+    GeometryError
+        If the process was killed or could not do its work.
+    """
+    last = "".join(said.strip().splitlines()[-1:])
+    if status < 0 and -status in CRASHES:
+        raise UnwrappingError(f"xatlas crashed ({signal.Signals(-status).name})")
+    if status:
+        why = f"was killed by signal {-status}" if status < 0 else last or f"status {status}"
+        raise GeometryError(
+            f"atlas: expected xatlas to unwrap the mesh, but its process failed ({why}); run "
+            'again with more memory free, or set atlas.method = "boxes"'
+        )
 
 
 def _assembled(

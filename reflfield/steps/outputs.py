@@ -29,7 +29,7 @@ from reflfield.steps.accounts import accounts_of
 from reflfield.steps.job import Job
 from reflfield.steps.quantising import missed_quality
 from reflfield.steps.rate_distortion import stored_points
-from reflfield.steps.surface import LEFT_OUT
+from reflfield.steps.surface import LEFT_OUT, METHOD
 
 # Sets of frames that are compared: title and sentence.
 FRAME_TITLES = {
@@ -211,7 +211,7 @@ def _surface_sections(
 ) -> Iterator[Section]:
     texels = job.texels
     origin = job.training.silhouette_origin(0)
-    hull = job.stages.record("hull")
+    hull, made = job.stages.record("hull"), job.stages.record("atlas")
     yield sections.silhouettes_section(
         _silhouette_views(job),
         origin={
@@ -224,7 +224,11 @@ def _surface_sections(
         texels.texel_of_pixel,
         texels.chart,
         average,
-        {"charts": int(texels.chart.max()) + 1, "texels": len(texels)},
+        {
+            "charts": int(texels.chart.max()) + 1,
+            METHOD: "" if made is None else str(made.counts.get(METHOD, "")),
+            "texels": len(texels),
+        },
     )
     yield sections.coverage_section(
         texels.texel_of_pixel, job.view_seen.sum(axis=1), job.observed.lights.sum(axis=1)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from reflfield.capture.model import Capture
 from reflfield.cluster import threads_here
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry.atlas import Atlas, build_atlas
+from reflfield.geometry.atlas import Atlas, built_atlas, fallback_words
 from reflfield.geometry.hull import visual_hull
 from reflfield.geometry.mesh import Mesh, write_ply
 from reflfield.geometry.plane import image_plane
@@ -32,6 +32,8 @@ from reflfield.steps.options import SMALLEST_TEXTURE
 
 # Among the counts of the hull: names of the views that it is made without.
 LEFT_OUT = "views left out"
+# Among the counts of the atlas: who made the charts.
+METHOD = "charts made by"
 # Views, or lights, of one block.
 DIRECTIONS_AT_ONCE = 8
 
@@ -98,14 +100,22 @@ def _listed(value: Any) -> Any:
 def write_atlas(job: Job, folder: Path) -> dict[str, Any]:
     """UV charts of the base surface, as fine as the photographs see it."""
     if job.is_plane:
-        atlas = image_plane(job.training.cameras[0], job.view_silhouettes[0])
+        atlas, method = image_plane(job.training.cameras[0], job.view_silhouettes[0]), "plane"
+        warnings: list[str] = []
     else:
         options = job.options.atlas
         resolution = options.resolution or derived_resolution(job, job.hull_mesh)
-        atlas = build_atlas(job.hull_mesh, replace(options, resolution=resolution))
+        built = built_atlas(job.hull_mesh, replace(options, resolution=resolution))
+        atlas, method = built.atlas, built.method
+        warnings = [fallback_words(built.reason)] if built.reason else []
     write_atlas_arrays(folder / "atlas.npz", atlas)
     job.__dict__.pop("surface_atlas", None)
-    return {"charts": int(atlas.chart.max()) + 1, "texture": [atlas.height, atlas.width]}
+    return {
+        "charts": int(atlas.chart.max()) + 1,
+        "texture": [atlas.height, atlas.width],
+        METHOD: method,
+        WARNINGS: warnings,
+    }
 
 
 def write_atlas_arrays(path: Path, atlas: Atlas) -> None:

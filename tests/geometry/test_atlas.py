@@ -9,7 +9,14 @@ import trimesh
 from reflfield.capture.cameras import Camera
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry import atlas as atlas_module
-from reflfield.geometry.atlas import Atlas, AtlasOptions, AtlasWarning, build_atlas
+from reflfield.geometry.atlas import (
+    Atlas,
+    AtlasOptions,
+    AtlasWarning,
+    UnwrappingError,
+    build_atlas,
+    built_atlas,
+)
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.plane import image_plane
 from reflfield.geometry.texels import TexelOptions, frames, texel_table, texture_axes
@@ -149,14 +156,86 @@ def test_a_single_triangle_anywhere_gets_a_chart(method, scale, origin):
     assert len(texels) > 150
 
 
-def test_a_worker_that_fails_or_hangs_leaves_box_charts(monkeypatch):
-    def hang(*_, **__):
-        raise subprocess.TimeoutExpired("xatlas", 0.1)
+def answers(monkeypatch, code):
+    """Let a script stand in for the worker; `WORKER` and its two paths are in sys.argv."""
+    monkeypatch.setattr(
+        atlas_module, "tied", lambda command: [sys.executable, "-c", code, *command[2:]]
+    )
 
-    monkeypatch.setattr(atlas_module.subprocess, "run", hang)
-    with pytest.warns(AtlasWarning, match="xatlas did not answer"):
-        atlas = build_atlas(torus(), AtlasOptions(resolution=64))
-    assert texels_covered_more_than_once(atlas) == 0
+
+def test_a_slow_machine_makes_the_same_atlas(monkeypatch):
+    mesh, options = torus(), AtlasOptions(resolution=64)
+    usual = built_atlas(mesh, options)
+    slow = "import os, runpy, sys, time; os.nice(19); time.sleep(2); sys.argv = sys.argv[1:]; "
+    one_core = "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); "
+    run = "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)"
+    answers(monkeypatch, slow + one_core + run)
+    slowly = built_atlas(mesh, options)
+    assert (usual.method, usual.reason) == (slowly.method, slowly.reason) == ("xatlas", "")
+    assert slowly.atlas.uv.tobytes() == usual.atlas.uv.tobytes()
+    assert slowly.atlas.faces.tobytes() == usual.atlas.faces.tobytes()
+
+
+def test_a_worker_that_hangs_is_an_error_and_no_other_atlas(monkeypatch):
+    answers(monkeypatch, "import time; time.sleep(60)")
+    with pytest.raises(GeometryError, match=r"within 0\.2 s, .* raise atlas\.time_limit_s"):
+        built_atlas(torus(), AtlasOptions(resolution=64, time_limit_s=0.2))
+
+
+def test_a_worker_that_crashes_leaves_box_charts_and_says_so(monkeypatch):
+    answers(monkeypatch, "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    built = built_atlas(torus(), AtlasOptions(resolution=64))
+    assert (built.method, built.reason) == ("boxes", "xatlas crashed (SIGSEGV)")
+    assert texels_covered_more_than_once(built.atlas) == 0
+    with pytest.warns(AtlasWarning, match="crashed .SIGSEGV.; the atlas is made of box charts"):
+        build_atlas(torus(), AtlasOptions(resolution=64))
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "killed by signal 9"),
+        ("raise ModuleNotFoundError('xatlas')", "ModuleNotFoundError: xatlas"),
+    ],
+    ids=["killed for memory", "not installed"],
+)
+def test_a_worker_that_the_machine_fails_is_an_error(monkeypatch, code, why):
+    answers(monkeypatch, code)
+    with pytest.raises(GeometryError, match=why):
+        built_atlas(torus(), AtlasOptions(resolution=64))
+
+
+def test_meshes_with_too_many_triangles_get_box_charts_on_every_machine(monkeypatch):
+    monkeypatch.setattr(atlas_module, "MOST_FACES", 100)
+    built = built_atlas(torus(), AtlasOptions(resolution=64))
+    assert built.method == "boxes"
+    assert "more than 100 triangles, and the mesh has 2304" in built.reason
+
+
+def test_charts_that_do_not_fit_are_said_not_to():
+    with pytest.raises(UnwrappingError, match=r"charts do not fit into 8 x 8 texels"):
+        atlas_module._xatlas_atlas(torus(), AtlasOptions(resolution=8, padding=4))
+
+
+def test_an_atlas_that_cannot_be_is_no_reason_for_box_charts(monkeypatch):
+    def broken(*_):
+        raise InputError("uv: expected values in [0, 1]")
+
+    monkeypatch.setattr(atlas_module, "_run_worker", broken)
+    with pytest.raises(InputError, match="uv"):
+        built_atlas(torus(), AtlasOptions(resolution=64))
+
+
+def test_the_worker_is_refused_more_memory_than_it_may_take():
+    script = (
+        "import numpy as np, reflfield.geometry.xatlas_worker as worker\n"
+        "worker._MOST_MEMORY = 2 << 30\n"
+        "worker.bound_memory()\n"
+        "np.zeros(3 << 27)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert done.returncode == 1
+    assert b"MemoryError" in done.stderr
 
 
 def test_the_worker_is_found_from_any_folder(tmp_path):
