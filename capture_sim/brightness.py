@@ -105,16 +105,28 @@ def _brightness(scene: Scene, tracer: RayTracer) -> Brightness:
     lights = tuple(scene.lights[i] for i in spread(len(scene.lights), TRIAL_LIGHTS))
     scales, peaks = [], []
     for index in spread(len(scene.cameras), TRIAL_VIEWS):
-        view = sample_view(plain, tracer, _coarser(scene.cameras[index]))
+        view = sample_view(plain, tracer, coarser(scene.cameras[index]))
         for image in shade(plain, tracer, view, lights):
             scales.append(frame_scale(image))
             peaks.append(float(image.max()))
     return _summary(np.array(scales), np.array(peaks), dark_noise(scene))
 
 
-def _coarser(camera: Table) -> Table:
-    """The same camera with fewer and larger pixels."""
-    factor = max(1.0, max(camera["w"], camera["h"]) / TRIAL_SIDE)
+def coarser(camera: Table, side: int = TRIAL_SIDE) -> Table:
+    """The same camera with larger pixels, if it has more than so many along its larger side.
+
+    Parameters
+    ----------
+    camera : dict
+        Camera of the native capture format.
+    side : int
+        Pixels.
+
+    Returns
+    -------
+    dict
+    """
+    factor = max(1.0, max(camera["w"], camera["h"]) / side)
     scaled = {key: camera[key] / factor for key in ("fl_x", "fl_y", "cx", "cy")}
     size = {key: max(1, int(camera[key] / factor)) for key in ("w", "h")}
     return {**camera, **scaled, **size}

@@ -17,6 +17,9 @@ from capture_sim.tables import Table, TableReader, check_number, check_vector
 
 Array = NDArray[np.float64]
 MOST_DIRECTIONS = 100_000
+# Metres from the world's origin, and irradiances that leave room for any BRDF in a single.
+FARTHEST = 1e9
+DARKEST, BRIGHTEST = 1e-18, 1e18
 # Within this sine of the pole, +Z cannot be an image's up direction; +Y is.
 POLE_SINE = 1e-6
 
@@ -226,6 +229,10 @@ def _rings_of(reader: TableReader) -> Array:
         raise scene_error(
             reader.what, "whole counts >= 1, elevations in [-90, 90]", "other values"
         )
+    if counts.sum() > MOST_DIRECTIONS:
+        raise scene_error(
+            reader.name("counts"), f"at most {MOST_DIRECTIONS} together", int(counts.sum())
+        )
     return rings(np.radians(elevations), [int(c) for c in counts], list(np.radians(offsets)))
 
 
@@ -237,11 +244,12 @@ def _fibonacci_of(reader: TableReader, n: int = 32, widest: float = 75.0) -> Arr
 
 def _list_of(reader: TableReader) -> Array:
     rows = reader.require("directions")
-    if not isinstance(rows, list) or not rows:
-        raise scene_error(reader.name("directions"), "a list of vectors", rows)
+    if not isinstance(rows, list) or not 1 <= len(rows) <= MOST_DIRECTIONS:
+        expected = f"a list of 1 to {MOST_DIRECTIONS} vectors"
+        raise scene_error(reader.name("directions"), expected, rows)
     vectors = np.array([check_vector(reader.name("directions"), row, 3) for row in rows])
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    if (lengths == 0.0).any():
+    if (lengths < 1e-100).any():
         raise scene_error(reader.name("directions"), "vectors that are not zero", "a zero one")
     return np.asarray(vectors / lengths)
 
@@ -302,7 +310,7 @@ def make_cameras(table: Table) -> list[dict[str, Any]]:
     """
     reader = TableReader("cameras", table)
     directions = _rig(reader, lights=False)
-    target = reader.vector("target", (0.0, 0.0, 0.0))
+    target = reader.vector("target", (0.0, 0.0, 0.0), low=-FARTHEST, high=FARTHEST)
     distance = reader.number("distance", 1.0, low=1e-4, high=1e6)
     lens = _lens(reader, distance)
     reader.finish()
@@ -419,7 +427,7 @@ def make_lights(table: Table) -> list[dict[str, Any]]:
     reader = TableReader("lights", table)
     directions = _rig(reader, lights=True)
     kind = reader.choice("kind", "point", ["point", "directional"])
-    target = reader.vector("target", (0.0, 0.0, 0.0))
+    target = reader.vector("target", (0.0, 0.0, 0.0), low=-FARTHEST, high=FARTHEST)
     distance = reader.number("distance", 1.0, low=1e-4, high=1e6)
     irradiance = _irradiance(reader, kind, distance)
     reader.finish()
@@ -432,7 +440,7 @@ def make_lights(table: Table) -> list[dict[str, Any]]:
 def _irradiance(reader: TableReader, kind: str, distance: float) -> Array:
     """Irradiance at the target, (3,) W/m2 per channel."""
     intensity = reader.take("intensity")
-    irradiance = reader.vector("irradiance", (np.pi,) * 3)
+    irradiance = reader.vector("irradiance", (np.pi,) * 3, low=-BRIGHTEST, high=BRIGHTEST)
     if intensity is not None:
         if kind != "point":
             raise scene_error(
@@ -440,8 +448,9 @@ def _irradiance(reader: TableReader, kind: str, distance: float) -> Array:
             )
         entries = [intensity] * 3 if isinstance(intensity, int | float) else intensity
         irradiance = check_vector(reader.name("intensity"), entries, 3) / distance**2
-    if (irradiance < 0.0).any() or not irradiance.any():
-        raise scene_error(reader.what, "a light that shines", irradiance.tolist())
+    if irradiance.min() < 0.0 or not DARKEST <= irradiance.max() <= BRIGHTEST:
+        expected = f"a light that shines: {DARKEST:g} to {BRIGHTEST:g} W/m2 at the target"
+        raise scene_error(reader.what, expected, irradiance.tolist())
     return irradiance
 
 

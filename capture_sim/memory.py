@@ -155,6 +155,8 @@ def _view(scene: Scene) -> int:
         each = BYTES_PER_PIXEL + len(scene.lights)  # a byte a light: which are visible
         sizes.append(BYTES_PER_POINT * points + each * n_pixels)
     smallest = _blocks_inside_each_other(scene) * SMALLEST_BLOCK + _photograph(scene)
+    if simulated(scene, interreflection):  # the paths of a point are traced together
+        smallest += interreflection.bytes_per_point(scene, len(scene.lights))
     return int(max(sizes)) + smallest
 
 

@@ -15,6 +15,7 @@ from capture_sim.materials import Material
 from capture_sim.objects import SurfaceMesh
 from capture_sim.stopwatch import Stopwatch
 
+MOST_PHOTOGRAPHS = 1_000_000
 Table = Mapping[str, Any]
 Options = TypeVar("Options")
 
@@ -196,6 +197,12 @@ class Scene:
             ids = [item["id"] for item in items]
             if not ids or len(set(ids)) != len(ids):
                 raise scene_error(what, "one or more entries with unique ids", ids)
+        if len(self.cameras) * len(self.lights) > MOST_PHOTOGRAPHS:
+            raise scene_error(
+                "cameras, lights",
+                f"at most {MOST_PHOTOGRAPHS:,} photographs",
+                f"{len(self.cameras)} views x {len(self.lights)} lights",
+            )
         if self.heldout_frames and any(c["model"] != "opencv" for c in self.cameras):
             raise scene_error(
                 "heldout.frames",

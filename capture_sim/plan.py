@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from capture_sim.brightness import measured, spread
+from capture_sim.brightness import coarser, measured, spread
 from capture_sim.effects import Cost, Effect, Workload, simulated
 from capture_sim.effects.registry import EFFECTS
 from capture_sim.files import write_exr
@@ -29,6 +29,8 @@ from capture_sim.truth import write_view_truth
 # Timed in earnest: enough to average over the sides of the object.
 TRIAL_VIEWS = 3
 TRIAL_LIGHTS = 6
+# Pixels along the larger side of the images that are tried; counts grow with the pixels.
+TRIAL_SIDE = 1024
 
 Table = Mapping[str, Any]
 Result = TypeVar("Result")
@@ -195,7 +197,10 @@ def _one_view(
     scene: Scene, tracer: RayTracer, camera: int, lights: tuple[Table, ...]
 ) -> tuple[float, ...]:
     """Points, lit part, seconds and bytes of a view, and of a photograph."""
-    view, view_seconds = _timed(lambda: sample_view(scene, tracer, scene.cameras[camera]))
+    whole = scene.cameras[camera]
+    identity = coarser(whole, TRIAL_SIDE)
+    more = whole["w"] * whole["h"] / (identity["w"] * identity["h"])
+    view, view_seconds = _timed(lambda: sample_view(scene, tracer, identity))
     images, shade_seconds = _timed(lambda: shade(scene, tracer, view, lights))
     with tempfile.TemporaryDirectory() as folder:
         sample = Path(folder) / "sample.exr"
@@ -203,18 +208,17 @@ def _one_view(
         _, write_seconds = _timed(lambda: write_exr(sample, brightest))
         size, truth_bytes, truth_seconds = sample.stat().st_size, 0, 0.0
         if scene.truth.per_view:
-            identity = scene.cameras[camera]
             _, truth_seconds = _timed(
                 lambda: write_view_truth(scene, tracer, identity, Path(folder))
             )
             truth_bytes = (Path(folder) / f"truth/views/{identity['id']}.npz").stat().st_size
     return (
-        len(view.points),
+        more * len(view.points),
         _lit_fraction(scene, view, lights),
-        view_seconds + truth_seconds,
-        truth_bytes,
-        shade_seconds / len(lights) + write_seconds,
-        size,
+        more * (view_seconds + truth_seconds),
+        more * truth_bytes,
+        more * (shade_seconds / len(lights) + write_seconds),
+        more * size,
     )
 
 

@@ -38,6 +38,7 @@ A scene file holds the tables below; only `object`, `material`, `cameras` and
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,6 +47,7 @@ from typing import Any
 from capture_sim.dome import make_cameras, make_lights
 from capture_sim.effects.registry import read_effects
 from capture_sim.errors import SceneError, scene_error
+from capture_sim.inputs import read_bytes
 from capture_sim.materials import make_material
 from capture_sim.model import EffectOptions, ImageOptions, Scene, TruthOptions
 from capture_sim.objects import make_object
@@ -65,6 +67,8 @@ __all__ = [
     "shipped_scenes",
 ]
 
+LARGEST_FILE = 4 << 20
+LONGEST_TEXT = 1000
 SHIPPED = Path(__file__).parent / "scenes"
 
 
@@ -103,7 +107,7 @@ def find_scene(name_or_path: str) -> Path:
         If there is neither.
     """
     path = Path(name_or_path)
-    if path.is_file():
+    if os.path.lexists(path) and not path.is_dir():
         return path
     shipped = SHIPPED / f"{name_or_path}.toml"
     if path.name == name_or_path and shipped.is_file():
@@ -135,11 +139,15 @@ def load_scene(name_or_path: str) -> Scene:
         value; the message names the file and the key.
     """
     path = find_scene(name_or_path)
-    table = _read_toml(path)
     try:
-        return parse_scene(table, default_name=path.stem, folder=path.parent)
+        return parse_scene(_read_toml(path), default_name=path.stem, folder=path.parent)
     except SceneError as error:
-        raise SceneError(f"{path}: {error}") from error
+        text = str(error)
+        raise SceneError(text if text.startswith(str(path)) else f"{path}: {text}") from error
+    except RecursionError as error:
+        raise scene_error(
+            str(path), "tables in some levels", "tables in each other without end"
+        ) from error
 
 
 def parse_scene(table: Table, *, default_name: str = "scene", folder: Path = Path()) -> Scene:
@@ -189,16 +197,21 @@ def parse_scene(table: Table, *, default_name: str = "scene", folder: Path = Pat
 
 
 def _read_toml(path: Path) -> Table:
+    content = read_bytes(path, LARGEST_FILE)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise scene_error(str(path), "a TOML file", str(error), "correct the syntax") from error
+        return tomllib.loads(content.decode("utf-8"))
+    except ValueError as error:  # of syntax, of encoding, of integers of too many digits
+        reason = " ".join(str(error).split())
+        raise scene_error(str(path), "a TOML file", reason, "correct the syntax") from error
 
 
 def _text(reader: TableReader, key: str, default: str) -> str:
     value = reader.take(key, default)
-    if not isinstance(value, str) or "\n" in value:
+    if not isinstance(value, str):
         raise scene_error(reader.name(key), "one line of text", value)
+    if not value.isprintable() or len(value) > LONGEST_TEXT:
+        expected = f"one line of up to {LONGEST_TEXT} printable characters"
+        raise scene_error(reader.name(key), expected, repr(value[:80]))
     return value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, field, fields
 from pathlib import Path
@@ -16,6 +15,10 @@ from capture_sim.inputs import check_regular
 
 Table = Mapping[str, Any]
 Options = TypeVar("Options")
+
+# Magnitude of a number that has no limit of its own: squares stay finite as singles.
+LARGEST_NUMBER = 1e18
+MOST_ENTRIES = 1024  # of a list of options
 
 
 class TableReader:
@@ -64,7 +67,12 @@ or correct it
         return f"{self.what}.{key}"
 
     def number(
-        self, key: str, default: float, *, low: float = -math.inf, high: float = math.inf
+        self,
+        key: str,
+        default: float,
+        *,
+        low: float = -LARGEST_NUMBER,
+        high: float = LARGEST_NUMBER,
     ) -> float:
         """Take a finite number in [low, high]."""
         return check_number(self.name(key), self.take(key, default), low=low, high=high)
@@ -86,17 +94,23 @@ or correct it
     def choice(self, key: str, default: str, choices: Sequence[str]) -> str:
         """Take one of the words `choices`."""
         value = self.take(key, default)
-        if value not in choices:
+        if not isinstance(value, str) or value not in choices:
             raise scene_error(self.name(key), "one of " + ", ".join(choices), value)
         return str(value)
 
     def vector(
-        self, key: str, default: Sequence[float], length: int = 3
+        self,
+        key: str,
+        default: Sequence[float],
+        length: int = 3,
+        *,
+        low: float = -LARGEST_NUMBER,
+        high: float = LARGEST_NUMBER,
     ) -> NDArray[np.float64]:
-        """Take `length` finite numbers; a single number stands for equal ones."""
+        """Take `length` numbers in [low, high]; a single number stands for equal ones."""
         value = self.take(key, default)
         entries = [value] * length if isinstance(value, int | float) else value
-        return check_vector(self.name(key), entries, length)
+        return check_vector(self.name(key), entries, length, low=low, high=high)
 
     def numbers(self, key: str, default: Sequence[float]) -> NDArray[np.float64]:
         """Take a list of any length of finite numbers."""
@@ -122,7 +136,7 @@ or correct it
 
 
 def check_number(
-    what: str, value: Any, *, low: float = -math.inf, high: float = math.inf
+    what: str, value: Any, *, low: float = -LARGEST_NUMBER, high: float = LARGEST_NUMBER
 ) -> float:
     """`value` as a finite float in [low, high]; a `SceneError` if it is not.
 
@@ -132,13 +146,21 @@ def check_number(
     1.0
     """
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or not low <= value <= high:
+    # Integers of any length are compared before they become floats; NaN is in no range.
+    if not is_number or not low <= value <= high:
         raise scene_error(what, f"a number in [{low:g}, {high:g}]", value)
     return float(value)
 
 
-def check_vector(what: str, value: Any, length: int) -> NDArray[np.float64]:
-    """`value` as `length` finite floats; a `SceneError` if it is not.
+def check_vector(
+    what: str,
+    value: Any,
+    length: int,
+    *,
+    low: float = -LARGEST_NUMBER,
+    high: float = LARGEST_NUMBER,
+) -> NDArray[np.float64]:
+    """`value` as `length` floats in [low, high]; a `SceneError` if it is not.
 
     Examples
     --------
@@ -147,14 +169,16 @@ def check_vector(what: str, value: Any, length: int) -> NDArray[np.float64]:
     """
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != length or not length:
         raise scene_error(what, f"a list of {length or 'one or more'} numbers", value)
-    return np.array([check_number(what, _plain(entry)) for entry in value])
+    return np.array([check_number(what, _plain(v), low=low, high=high) for v in value])
 
 
 def _plain(entry: Any) -> Any:
     return entry.item() if isinstance(entry, np.generic) else entry
 
 
-def bounded(default: Any, *, low: float = -math.inf, high: float = math.inf) -> Any:
+def bounded(
+    default: Any, *, low: float = -LARGEST_NUMBER, high: float = LARGEST_NUMBER
+) -> Any:
     """Field of an options dataclass: a number, whole number or tuple of numbers in a range.
 
     Parameters
@@ -216,6 +240,10 @@ def _option(reader: TableReader, one: Field[Any]) -> Any:
         return reader.count(one.name, default, low=int(low), high=int(high))
     if isinstance(default, tuple):
         entries = reader.numbers(one.name, default)
+        if len(entries) > MOST_ENTRIES:
+            raise scene_error(
+                reader.name(one.name), f"at most {MOST_ENTRIES} numbers", len(entries)
+            )
         return tuple(
             check_number(reader.name(one.name), v, low=low, high=high) for v in entries.tolist()
         )

@@ -157,9 +157,23 @@ def apply(
     return radiance
 
 
+def bytes_per_point(scene: Scene, n_lights: int) -> int:
+    """Temporaries of the paths of one point.
+
+    Parameters
+    ----------
+    scene : Scene
+    n_lights : int
+
+    Returns
+    -------
+    int
+    """
+    return scene.effects.get(Options).paths * (BYTES_PER_PATH + n_lights * BYTES_BROUGHT)
+
+
 def _blocks(scene: Scene, points: SurfacePoints, lights: LightArrays) -> list[slice]:
-    paths = scene.effects.get(Options).paths
-    step = scene.blocks.items(paths * (BYTES_PER_PATH + len(lights) * BYTES_BROUGHT))
+    step = scene.blocks.items(bytes_per_point(scene, len(lights)))
     return [slice(first, first + step) for first in range(0, len(points), step)]
 
 

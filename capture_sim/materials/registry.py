@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -201,10 +201,12 @@ def make_material(
 
 def _with_preset(table: Table, what: str) -> dict[str, Any]:
     """Entries of the table over those of the preset that it names."""
+    if not isinstance(table, Mapping):
+        raise scene_error(what, "a table of a material", table)
     entries = dict(table)
     if (name := entries.pop("preset", None)) is None:
         return entries
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise scene_error(f"{what}.preset", "one of " + ", ".join(sorted(PRESETS)), name)
     return {**material_presets()[name], **entries}
 
@@ -291,7 +293,7 @@ def _conductor(
 ) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
     metal, eta, kappa = (reader.take(key) for key in ("metal", "eta", "kappa"))
     if metal is not None:
-        if metal not in METALS:
+        if not isinstance(metal, str) or metal not in METALS:
             raise scene_error(reader.name("metal"), "one of " + ", ".join(METALS), metal)
         return METALS[metal]
     if eta is None and kappa is None:

@@ -45,7 +45,7 @@ def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
         raise scene_error(reader.name("file"), "triangles with an area", f"none in {path}")
     vertices = found.vertices
     rotation = Rotation.from_euler(
-        "xyz", reader.vector("rotation_deg", (0, 0, 0)), degrees=True
+        "xyz", reader.vector("rotation_deg", (0, 0, 0), low=-1e6, high=1e6), degrees=True
     )
     vertices = rotation.apply(vertices)
     if reader.flag("centre", True):
@@ -53,7 +53,9 @@ def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     extent = float(np.ptp(vertices, axis=0).max())
     scale = reader.number("scale", 1.0, low=1e-9, high=1e9)
     size = reader.number("size", extent * scale, low=1e-9, high=1e9)
-    vertices = vertices * (size / extent) + reader.vector("position", (0, 0, 0))
+    vertices = vertices * (size / extent) + reader.vector(
+        "position", (0, 0, 0), low=-1e9, high=1e9
+    )
     smooth = reader.flag("smooth", True)
     mesh = finish_mesh(vertices, found.faces, found.uv, path.name, smooth=smooth)
     return replace(mesh, notes=tuple(f"{path.name}: {note}" for note in found.notes))

@@ -49,8 +49,10 @@ def relief(reader: TableReader, folder: Path) -> SurfaceMesh:
 
 def _plate_size(reader: TableReader, default: tuple[float, float]) -> Array:
     size = reader.vector("size", default, length=2)
-    if (size <= 0.0).any():
-        raise scene_error(reader.name("size"), "two lengths > 0", size.tolist(), "metres")
+    if not ((size >= 1e-6) & (size <= 1e3)).all():
+        raise scene_error(
+            reader.name("size"), "two lengths in [1e-06, 1000]", size.tolist(), "metres"
+        )
     return size
 
 

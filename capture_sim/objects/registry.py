@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -82,9 +82,11 @@ def make_object(table: Table, folder: Path = Path()) -> SurfaceMesh:
     >>> round(make_object({"preset": "sphere", "radius": 0.05}).radius, 9)
     0.05
     """
+    if not isinstance(table, Mapping):
+        raise scene_error("object", "a table", table)
     entries = dict(table)
     if (name := entries.pop("preset", None)) is not None:
-        if name not in PRESETS:
+        if not isinstance(name, str) or name not in PRESETS:
             raise scene_error("object.preset", "one of " + ", ".join(sorted(PRESETS)), name)
         entries = {**object_presets()[name], **entries}
     reader = TableReader("object", entries)
