@@ -34,6 +34,8 @@ Reader = Callable[[NDArray[np.intp]], RootedSamples]
 # Partial sums are formed for this many parts and added in order, so that the result does
 # not depend on the number of workers.
 N_PARTS = 8
+# Root mean square of the means of usual samples, as cube roots.
+USUAL_SIZE = 0.35
 # Squares of this size stand for zero; far below what any unit of the data gives.
 LEAST_ENERGY = 1e-200
 
@@ -655,6 +657,25 @@ def fit_basis(
     chosen = np.sort(rng.choice(observed, min(n_chosen, len(observed)), replace=False))
     with ThreadPoolExecutor(workers) as pool:
         return _alternate(read(chosen), start, chosen, options, pool)
+
+
+def of_usual_size(model: ClusteredModel) -> ClusteredModel:
+    """Same model with coefficients as large as for means of root mean square `USUAL_SIZE`.
+
+    The basis is of unit size when it comes from a grid, and the coefficients are in the unit of
+    the samples. How strongly smoothness then holds the basis back would depend on that unit.
+    """
+    size = float(np.sqrt(np.mean(np.square(model.mean, dtype=np.float64)))) / USUAL_SIZE
+    if not size > 0:
+        return model
+    table = model.table.copy()
+    table[..., 3:] *= np.float32(size)
+    return replace(
+        model,
+        table=table,
+        coefficients=model.coefficients / np.float32(size),
+        precision=model.precision * size**2,
+    )
 
 
 def _alternate(

@@ -35,6 +35,10 @@ NOT_MEASURED = ("saturated", "transparent", "dark")
 # Those that do: black is less than the file can say.
 IS_KNOWN = np.array([kind in ("measured", "black") for kind in VALUE_KINDS])
 IS_GAP = np.array([kind in NOT_MEASURED for kind in VALUE_KINDS])
+# Code 0 is a measurement: it says that the value is less than half of the least code. Numbers
+# spread evenly up to there have cube roots of three quarters of the largest on average, known
+# to a fifth: with the smallest value of the photograph for the least code, this share of it.
+BLACK_SHARE = 0.75**3 / 2
 # A pixel of less weight in a bilinear sample changes it by less than a half float's rounding
 # of eleven bits: what such a pixel is does not matter.
 LEAST_WEIGHT = 2.0**-11
@@ -228,7 +232,8 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         measured |= part["measured"]
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
     found = Projected(n_photographs, np.concatenate(values), bits)
-    note_gaps(projection.location, any(found.count(kind) for kind in NOT_MEASURED))
+    n_gaps = sum(found.count(kind) for kind in NOT_MEASURED)
+    note_gaps(projection.location, n_gaps / max(int(found.values.sum()), 1))
     return found
 
 
@@ -334,9 +339,11 @@ def _samples_at(
     images, kinds = [], np.zeros((len(points), len(lights), 3), np.uint8)
     for j, index in enumerate(indices):
         image, measured = capture.read_measured(int(index))
-        images.append(image)
         if not measured.all():
-            _mark_kinds(pixel_kinds(image, measured), pixels, LEAST_WEIGHT, kinds[:, j])
+            of_pixels = pixel_kinds(image, measured)
+            image = with_bounded_black(image, of_pixels)
+            _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
+        images.append(image)
     irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
     # A light may have no blue, a spot may miss a texel: nothing is learned there.
     lit = irradiance > 0
@@ -364,6 +371,22 @@ def pixel_kinds(image: Floats, measured: NDArray[np.bool_]) -> Kinds:
     kinds[image <= 0] = VALUE_KINDS.index("black")
     kinds[measured] = 0
     return kinds
+
+
+def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
+    """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
+
+    Examples
+    --------
+    >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
+    >>> kinds = pixel_kinds(image, image > 0)
+    >>> with_bounded_black(image, kinds)[0, 0].round(3)
+    array([0.105, 0.021, 0.211], dtype=float32)
+    """
+    black = kinds == VALUE_KINDS.index("black")
+    positive = np.where(image > 0, image, np.inf).min(axis=(0, 1))
+    darkest = np.where(np.isfinite(positive), positive, 0.0)
+    return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
 
 
 @numba.njit(cache=True, nogil=True)

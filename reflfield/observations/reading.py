@@ -45,6 +45,8 @@ def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
 
 # Directions of so many are worked out together to count samples.
 TEXELS_COUNTED_AT_ONCE = 1024
+# Share of the values that may be missing before nodes are weighted channel by channel.
+FEW_GAPS = 0.01
 # Samples that are looked through for those not measured.
 COUNTING_BYTES = 64 << 20
 
@@ -187,8 +189,12 @@ class TexelReader:
 
     @property
     def weight_channels(self) -> int:
-        """Weights of a pair of nodes: one, or three where values were not measured."""
-        return 3 if self.store.has_gaps else 1
+        """Weights of a pair of nodes: one, or three where channels were measured apart.
+
+        Where that is a trace, a node counts as far as the least observed channel, and the
+        completion takes a third of the work.
+        """
+        return 3 if self.store.gaps > FEW_GAPS else 1
 
     @property
     def sample_bytes_per_texel(self) -> int:
@@ -350,7 +356,9 @@ class NodeColumns:
         back = np.argsort(order)
         k, channels = len(chosen), self.reader.weight_channels
         weights = nodes.weights
-        if channels == 3 and weights.ndim == 3:
+        if weights.ndim == 3 and channels == 3:
             # Of these texels everything was measured.
             weights = np.repeat(weights[..., None], 3, axis=3)
+        elif weights.ndim == 4 and channels == 1:
+            weights = weights.min(axis=3)
         return nodes.values.reshape(k, -1)[back].T, weights.reshape(k, -1)[back].T

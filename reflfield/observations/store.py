@@ -46,7 +46,8 @@ SAMPLE_BYTES = 6
 SAMPLES_PREFIX = "samples-"
 # What chunks hold that were never written.
 UNWRITTEN = -np.inf
-# Attributes of the array: what its numbers are in, and whether values that count may be NaN.
+# Attributes of the array: what its numbers are in, and which share of those that cameras see is
+# NaN.
 UNIT, GAPS = "unit", "gaps"
 # How long a process that ends waits for zarr's thread; zarr waits for 0.2 s, then raises.
 ENDING_SECONDS = 10.0
@@ -149,9 +150,17 @@ class ObservationStore:
         return float(self.samples.attrs.get(UNIT, 1.0))
 
     @cached_property
+    def gaps(self) -> float:
+        """Share of the values seen by cameras that was not measured, and is NaN.
+
+        Of samples that are not finished it is not known: 1.
+        """
+        return float(self.samples.attrs.get(GAPS, 1.0))
+
+    @property
     def has_gaps(self) -> bool:
         """Whether some values of samples that count were not measured, and are NaN."""
-        return bool(self.samples.attrs.get(GAPS, True))
+        return self.gaps > 0
 
     @property
     def n_texels(self) -> int:
@@ -364,10 +373,10 @@ def _created(
         )  # fmt: skip
 
 
-def note_gaps(location: Location, has_gaps: bool) -> None:
-    """Note with finished samples whether values of those that count were not measured."""
+def note_gaps(location: Location, share: float) -> None:
+    """Note with finished samples which share of the values seen was not measured."""
     with naming(str(location)):
-        open_samples(location).attrs[GAPS] = has_gaps
+        open_samples(location).attrs[GAPS] = share
 
 
 def open_samples(location: Location, mode: Literal["r", "r+"] = "r+") -> zarr.Array:

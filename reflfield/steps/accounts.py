@@ -86,7 +86,7 @@ def _values(job: Job, projected: dict[str, Any]) -> Account:
     names = {
         "measured": "measured",
         "saturated": "saturated: left out",
-        "black": "at code 0, darker than the file can say: taken for black",
+        "black": "at code 0: taken for what is too dark for the file",
         "transparent": "under alpha 0: left out",
         "dark": "of a colour that the light has not: left out",
         "unlit": "the light gives nothing there",

@@ -18,11 +18,9 @@ Bools = NDArray[np.bool_]
 MEASURED = "measured.npz"
 # Less than this share of the values that cameras see is a trace.
 TRACE = 1e-3
-# What is told of, and the remedy.
+# What is told of, and the remedy. Not of black: an object has sides that no light reaches.
 TOLD = {
     "saturated": "saturated and left out; expose shorter, or bracket",
-    "black": "at code 0, darker than the file can say, and taken for black; expose longer, "
-    "or bracket",
     "transparent": "under alpha 0 and left out; check silhouettes and cameras",
 }
 

@@ -16,6 +16,7 @@ from reflfield.field.fit import (
     ClusteredModel,
     SampleFitOptions,
     fit_basis,
+    of_usual_size,
     solve_coefficients,
 )
 from reflfield.field.frames import improved_block as turned
@@ -118,6 +119,7 @@ class _Fitting:
         if not self.fits_samples(options):
             return model, self.reader
         free = self.found.frames.free
+        model = of_usual_size(model)
         return _fitted_to_samples(self.job, model, self.reader, free, self.blocks, name)
 
 

@@ -11,8 +11,10 @@ from reflfield.field.fit import (
     ClusteredModel,
     SampleFitOptions,
     _BasisProblem,
+    fit_basis,
     fit_samples,
     normalised,
+    of_usual_size,
     roughness,
     solve_coefficients,
 )
@@ -498,3 +500,23 @@ class TestFit:
 def test_options_are_checked(changes, message):
     with pytest.raises(InputError, match=message):
         SampleFitOptions(**changes)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("scale", [2.0**-40, 2.0**-3, 2.0**30])
+def test_fit_from_a_grid_does_not_depend_on_the_unit(rng, scale):
+    """Exactly: powers of two are scaled without rounding."""
+    model = planted_model(rng, 60)
+    samples = measured(empty_samples(rng, 60, 7, 6), model, rng, 0.1)
+    # A grid's basis is of unit size, its coefficients are in the unit of the samples.
+    grid = replace(model, precision=model.precision * 0.01)
+    table = grid.table.copy()
+    table[..., :3] *= scale
+    scaled = replace(grid, table=table, coefficients=np.float32(scale) * grid.coefficients)
+    in_unit = replace(samples, values=np.float32(scale) * samples.values)
+    options = SampleFitOptions(rounds=2, iterations=4)
+    found = [
+        fit_basis(lambda t, s=s: part(s, t), of_usual_size(start), np.arange(60), 1000, options)
+        for start, s in ((grid, samples), (scaled, in_unit))
+    ]
+    np.testing.assert_array_equal(found[1].table, np.float32(scale) * found[0].table)

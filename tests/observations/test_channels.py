@@ -15,7 +15,7 @@ from reflfield.observations.resampling import (
     local_directions,
     resample,
 )
-from reflfield.observations.store import ObservationStore, Observed, create_samples
+from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.sphere.hemisphere import softened_cosine
 
 from .rigs import dome, hemisphere, rooted, texel_samples, tilted_frames
@@ -94,6 +94,14 @@ def test_columns_have_a_weight_for_each_row(reader_of):
     np.testing.assert_array_equal(
         weights.T.reshape(2, 9, 25, 3), reader.nodes(np.array([3, 1])).weights[[0, 1]]
     )
+
+
+def test_a_trace_of_gaps_leaves_a_weight_for_each_pair_of_nodes(reader_of):
+    reader = reader_of(4, 3, [0.3, 0.2, 0.1])
+    note_gaps(reader.store.location, 0.001)
+    _, weights = NodeColumns(reader, np.arange(N)).read(np.array([3, 1]))
+    least = reader.nodes(np.array([3, 1])).weights.min(axis=3)
+    np.testing.assert_array_equal(weights.T.reshape(2, 9, 25), least)
 
 
 @pytest.mark.reference

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.image_writing import write_exr
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Exposure, Photograph
 from reflfield.errors import InputError, ShapeError
@@ -248,6 +248,69 @@ class TestProjection:
             Projection(capture, np.zeros((2, 2)), np.ones((2, 1), bool), tmp_path)
         with pytest.raises(ShapeError, match="visible"):
             Projection(capture, np.zeros((2, 3)), np.ones((2, 3), bool), tmp_path)
+
+
+class TestClipping:
+    """Photographs of eight bits, one exposure, as a camera writes them."""
+
+    @pytest.fixture
+    def found(self, tmp_path):
+        """Return a function from codes (h, w, 3) to samples at pixel centres, and counts."""
+
+        def run(codes, offset=0.0):
+            write_png(tmp_path / "p.png", codes.astype(np.uint8))
+            photograph = Photograph("p", 0, 0, (Exposure(tmp_path / "p.png"),))
+            sun = Light("l0", "directional")
+            capture = Capture("clipped", tmp_path, (camera("v0"),), (sun,), (photograph,))
+            y, x = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
+            positions = np.stack([x + 0.5 + offset - WIDTH / 2, HEIGHT / 2 - y - 0.5, 0 * x], 1)
+            visible = np.ones((len(positions), 1), bool)
+            projection = Projection(capture, positions, visible, tmp_path / "store")
+            projected = project_photographs(projection, Blocks(Scheduler(), tmp_path / "b"))
+            observed = Observed(visible, np.ones_like(visible), np.ones((1, 1), bool))
+            stored = ObservationStore(tmp_path / "store", observed)
+            values = stored.read(slice(None)).astype(np.float64) * stored.unit
+            return values.reshape(HEIGHT, WIDTH, 3), projected, stored
+
+        return run
+
+    def test_saturated_values_are_not_measured(self, found):
+        codes = np.full((HEIGHT, WIDTH, 3), 100)
+        codes[2, 3] = [255, 200, 255]
+        values, projected, stored = found(codes)
+        expected = np.zeros(values.shape, bool)
+        expected[2, 3] = [True, False, True]
+        assert np.array_equal(np.isnan(values), expected)
+        assert projected.count("saturated") == 2
+        assert projected.count("measured") == values.size - 2
+        assert stored.gaps == 2 / values.size
+        assert projected.measured.all()  # the green of that pixel
+
+    def test_beside_a_saturated_pixel_nothing_is_measured(self, found):
+        codes = np.full((HEIGHT, WIDTH, 3), 100)
+        codes[2, 3] = 255
+        values, projected, _ = found(codes, offset=0.25)
+        # A quarter of the way from pixel 3 to 4, and three quarters from 2 to 3.
+        assert np.argwhere(np.isnan(values[..., 0])).tolist() == [[2, 2], [2, 3]]
+        assert projected.count("saturated") == 6
+
+    def test_code_zero_is_the_bounded_measurement_that_it_is(self, found):
+        codes = np.full((HEIGHT, WIDTH, 3), 100)
+        codes[1, 1], codes[4, 4] = 1, 0
+        values, projected, stored = found(codes)
+        # Of numbers spread evenly below half a code the mean cube root is three quarters of
+        # the largest; halves round to 2^-25 of the unit.
+        least = 1 / 255 / 12.92
+        np.testing.assert_allclose(values[1, 1], least, atol=2.0**-25)
+        np.testing.assert_allclose(values[4, 4], 0.75**3 * least / 2, atol=2.0**-25)
+        assert projected.count("black") == 3
+        assert stored.gaps == 0
+
+    def test_texel_of_which_nothing_was_measured_is_told(self, found):
+        codes = np.full((HEIGHT, WIDTH, 3), 100)
+        codes[5, 6] = 255
+        _, projected, _ = found(codes)
+        assert np.flatnonzero(~projected.measured[:, 0]).tolist() == [5 * WIDTH + 6]
 
 
 class TestDirections:

@@ -23,7 +23,7 @@ def reader_of(tmp_path, rng):
         n = len(samples)
         stored = create_samples(tmp_path / "store", n, capture.n_views, capture.n_lights)
         stored[:] = samples.astype(np.float16)
-        note_gaps(tmp_path / "store", bool(np.isnan(samples).any()))
+        note_gaps(tmp_path / "store", float(np.isnan(samples).mean()))
         seen = {
             "views": np.ones((n, capture.n_views), bool),
             "lights": np.ones((n, capture.n_lights), bool),
