@@ -24,8 +24,9 @@ MAX_DOCUMENT_BYTES = 80 * 2**20
 MAX_VALUES = 4_000_000
 MAX_OBJECTS = 500_000
 
-# Photographs, cameras and lights of a description, and pairs of camera and light.
-MAX_ENTRIES = 100_000
+# Photographs of a description, its cameras or its lights, and pairs of camera and light.
+MAX_PHOTOGRAPHS = 100_000
+MAX_ENTRIES = 20_000
 MAX_PAIRS = 50_000_000
 
 # Largest coordinate (in the capture's unit) and pixel coordinate: their squares and
@@ -200,18 +201,22 @@ def number_array(
 
 
 def check_counts(what: str, n_cameras: int, n_lights: int, n_photographs: int) -> None:
-    """Refuse captures larger than `MAX_ENTRIES` entries or `MAX_PAIRS` pairs.
+    """Refuse captures of more than `MAX_PHOTOGRAPHS`, `MAX_ENTRIES` or `MAX_PAIRS`.
 
     Raises
     ------
     CaptureError
         Naming the description and what there is too much of.
     """
-    counts = {"cameras": n_cameras, "lights": n_lights, "photographs": n_photographs}
-    for name, count in counts.items():
-        if count > MAX_ENTRIES:
+    counts = {
+        "cameras": (n_cameras, MAX_ENTRIES),
+        "lights": (n_lights, MAX_ENTRIES),
+        "photographs": (n_photographs, MAX_PHOTOGRAPHS),
+    }
+    for name, (count, most) in counts.items():
+        if count > most:
             raise CaptureError(
-                f"{what}: expected at most {MAX_ENTRIES:,} {name}, received {count:,}; "
+                f"{what}: expected at most {most:,} {name}, received {count:,}; "
                 "split the capture"
             )
     if n_cameras * n_lights > MAX_PAIRS:

@@ -98,14 +98,14 @@ def check_native(document: Mapping[str, Any], description: Path) -> None:
     by_pattern = isinstance(document.get("photographs"), dict)
     n_photographs = n_cameras * n_lights if by_pattern else n_listed
     check_counts(str(description), n_cameras, n_lights, n_photographs)
-    error = best_match(islice(_validator().iter_errors(document), FAULTS_COMPARED))
-    if error is not None:
-        where = error.json_path.removeprefix("$").removeprefix(".") or "the description"
-        text = error.message if len(error.message) < 300 else error.message[:300] + " ..."
-        raise CaptureError(
-            f"{description}: {printable(where)}: {printable(text)} "
-            f"(schema capture-v{VERSION}.json)"
-        )
+    listed = document.get("photographs")
+    photographs = listed if isinstance(listed, list) else []
+    # The first stands for the whole list, whose entries follow one by one.
+    short = {**document, "photographs": photographs[:1]} if photographs else document
+    _check_part(_validator(), short, "", description)
+    for number, entry in enumerate(photographs):
+        if not _is_plain(entry):
+            _check_part(_photograph_validator(), entry, f".photographs[{number}]", description)
     name = document.get("name", "")
     if has_controls(name):
         raise CaptureError(
@@ -130,6 +130,30 @@ def schema() -> dict[str, Any]:
 @cache
 def _validator() -> Any:
     return Draft202012Validator(schema())
+
+
+@cache
+def _photograph_validator() -> Any:
+    """Of one entry of the list of photographs."""
+    return Draft202012Validator({"$defs": schema()["$defs"], "$ref": "#/$defs/photograph"})
+
+
+def _check_part(validator: Any, part: Any, where: str, description: Path) -> None:
+    """Refuse a part of the description by its most telling fault."""
+    error = best_match(islice(validator.iter_errors(part), FAULTS_COMPARED))
+    if error is not None:
+        path = where + error.json_path.removeprefix("$")
+        text = error.message if len(error.message) < 300 else error.message[:300] + " ..."
+        raise CaptureError(
+            f"{description}: {printable(path.removeprefix('.') or 'the description')}: "
+            f"{printable(text)} (schema capture-v{VERSION}.json)"
+        )
+
+
+def _is_plain(entry: Any) -> bool:
+    """Whether an entry surely fits the schema: a camera, a light and a file, all texts."""
+    plain = isinstance(entry, dict) and set(entry) == {"camera", "light", "file"}
+    return plain and all(isinstance(v, str) and 0 < len(v) <= 200 for v in entry.values())
 
 
 def _camera(entry: Mapping[str, Any], description: Path) -> Camera:

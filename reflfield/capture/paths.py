@@ -36,6 +36,7 @@ class NamedFiles:
         self.follow_links = follow_links
         self._resolved_root = self.root.resolve()
         self._listings: dict[Path, dict[str, list[str]]] = {}
+        self._answers: dict[tuple[str, ...], Path] = {}
 
     def path(self, text: object, suffixes: Sequence[str] = ()) -> Path:
         """Path of a file that the description names.
@@ -58,6 +59,12 @@ class NamedFiles:
         CaptureError
             If the path is absolute, leads outside, or holds control characters.
         """
+        key = (repr(text), *suffixes)
+        if key not in self._answers:
+            self._answers[key] = self._sought(text, suffixes)
+        return self._answers[key]
+
+    def _sought(self, text: object, suffixes: Sequence[str]) -> Path:
         names = self._names(text)
         for name in names:
             self._check_inside(name)

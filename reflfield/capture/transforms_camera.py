@@ -33,18 +33,26 @@ MODELS = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 
+# What a frame says of its camera, its size apart.
+CAMERA_KEYS = (
+    "transform_matrix", "camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", *LENS_KEYS,
+    "camera_angle_x", "camera_angle_y", "camera_intrinsics",
+)  # fmt: skip
+
 # OpenGL camera axes (x right, y up, z back) seen from OpenCV's (x right, y down, z forward).
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def frame_camera(frame: Frame, path: Path) -> Camera:
-    """Camera of a frame, named after its file.
+def frame_camera(frame: Frame, name: str, size: tuple[int, int]) -> Camera:
+    """Camera of a frame.
 
     Parameters
     ----------
     frame : Frame
-    path : Path
-        Its photograph, asked for the image size where the frame does not say.
+    name : str
+        Id of the camera in messages.
+    size : (width, height) int
+        See `frame_size`.
 
     Returns
     -------
@@ -55,12 +63,12 @@ def frame_camera(frame: Frame, path: Path) -> Camera:
     CaptureError
         Naming the frame and the key.
     """
-    width, height = _size(frame, path)
+    width, height = size
     fl_x, fl_y = _focal_lengths(frame, width, height)
     cx, cy = _principal_point(frame, width, height)
     try:
         return Camera(
-            id=path.stem,
+            id=name,
             kind=FISHEYE if _model(frame) == "OPENCV_FISHEYE" else OPENCV,
             width=width,
             height=height,
@@ -92,8 +100,14 @@ def _pose(frame: Frame) -> NDArray[np.float64]:
     return OPENCV_FROM_OPENGL @ np.linalg.solve(matrix, np.eye(4))
 
 
-def _size(frame: Frame, path: Path) -> tuple[int, int]:
-    """Image size as stated, else as the photograph's header says."""
+def frame_size(frame: Frame, path: Path) -> tuple[int, int]:
+    """Width and height as stated, else as the header of the photograph at `path` says.
+
+    Raises
+    ------
+    CaptureError
+        If a stated size is out of range, or there is no photograph to ask.
+    """
     if frame.get("w") is not None and frame.get("h") is not None:
         return _pixels(frame, "w"), _pixels(frame, "h")
     if path.is_file():

@@ -28,9 +28,9 @@ from reflfield.capture.names import IMAGE_SUFFIXES, printable, quoted, unique_na
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
 from reflfield.capture.stated_readings import READING_KEYS, stated_reading
-from reflfield.capture.transforms_camera import frame_camera
+from reflfield.capture.transforms_camera import CAMERA_KEYS, frame_camera, frame_size
 from reflfield.capture.transforms_frame import SPLIT_KEYS, Frame, check_keys, leading_digits
-from reflfield.capture.transforms_light import check_lights, frame_light
+from reflfield.capture.transforms_light import LIGHT_KEYS, check_lights, frame_light
 from reflfield.errors import CaptureError
 
 FILE_NAME = "transforms.json"
@@ -65,18 +65,33 @@ class _Reading:
     silhouettes: dict[int, Path] = field(default_factory=dict)
     photographs: list[Photograph] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    said: dict[str, int] = field(default_factory=dict)
     readings: dict[str, ImageReading] = field(default_factory=dict)
 
     def add(self, frame: Frame, is_test: bool) -> None:
         """Read one frame."""
         path = _image_path(self.files, frame)
-        camera = frame_camera(frame, path)
-        view = self.cameras.add(_camera_key(camera), camera)
-        light = self.lights.add(*frame_light(frame, self.files))
+        view, light = self._view(frame, path), self._light(frame)
         if frame.get("mask_path"):
             self.silhouettes.setdefault(view, self.files.path(frame.get("mask_path")))
         exposure = Exposure(path, reading=self._image_reading(frame))
         self.photographs.append(Photograph("", view, light, (exposure,), is_test=is_test))
+
+    def _view(self, frame: Frame, path: Path) -> int:
+        """Index of the frame's camera; frames that say the same are read once."""
+        size = frame_size(frame, path)
+        said = repr((id(frame.common), size, [frame.own.get(key) for key in CAMERA_KEYS]))
+        if said not in self.said:
+            camera = frame_camera(frame, path.stem, size)
+            self.said[said] = self.cameras.add(_camera_key(camera), camera)
+        return self.said[said]
+
+    def _light(self, frame: Frame) -> int:
+        """Index of the frame's light; frames that say the same are read once."""
+        said = repr((id(frame.common), [frame.own.get(key) for key in LIGHT_KEYS]))
+        if said not in self.said:
+            self.said[said] = self.lights.add(*frame_light(frame, self.files))
+        return self.said[said]
 
     def _image_reading(self, frame: Frame) -> ImageReading:
         """How the frame's file is read; frames that say the same share one reading."""

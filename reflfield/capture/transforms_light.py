@@ -13,6 +13,8 @@ from reflfield.capture.paths import NamedFiles
 from reflfield.capture.transforms_frame import Frame, leading_digits
 from reflfield.errors import CaptureError
 
+LIGHT_KEYS = ("pl_pos", "pl_intensity", "environment", "environment_convention")
+
 # Members of one frame's light: a dome has hundreds of lamps.
 MOST_LIGHTS_AT_ONCE = 10_000
 

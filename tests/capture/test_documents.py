@@ -134,7 +134,7 @@ class TestNumbers:
         ("counts", "reason"),
         [
             ((1, 1, 100_001), "at most 100,000 photographs, received 100,001"),
-            ((100_001, 1, 1), "at most 100,000 cameras"),
+            ((20_001, 1, 1), "at most 20,000 cameras"),
             ((10_000, 10_000, 1), r"at most 50,000,000 pairs.*10,000 x 10,000"),
         ],
     )
