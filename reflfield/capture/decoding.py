@@ -125,7 +125,6 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
             header,
             layer.part,
             profile=_profile(spec),
-            adobe_rgb=spec.get_string_attribute("Exif:InteroperabilityIndex") == "R03",
             is_float=pixels.dtype == np.float32 and str(spec.format) in _FLOATS,
         )
         straight = header.kind == "png" or bool(

@@ -32,13 +32,6 @@ class Window(NamedTuple):
         return self.right - self.left + 1, self.bottom - self.top + 1
 
 
-class ExrChannel(NamedTuple):
-    """A channel: `sampling` is (1, 1) where every pixel has a value."""
-
-    name: str
-    sampling: tuple[int, int]
-
-
 @dataclass(frozen=True)
 class ExrPart:
     """One part of an OpenEXR file.
@@ -49,7 +42,8 @@ class ExrPart:
         Number of the part.
     name : str
         Empty where there is one part without a name.
-    channels : tuple of ExrChannel
+    channels : tuple of str
+        Names.
     data_window, display_window : Window
     deep : bool
         Whether its pixels are lists of samples.
@@ -59,7 +53,7 @@ class ExrPart:
 
     index: int
     name: str
-    channels: tuple[ExrChannel, ...]
+    channels: tuple[str, ...]
     data_window: Window
     display_window: Window
     deep: bool
@@ -68,7 +62,7 @@ class ExrPart:
     @property
     def luminance_chroma(self) -> bool:
         """Whether colour is stored as Y and two differences at half the resolution."""
-        return {"Y", "RY", "BY"} <= {channel.name for channel in self.channels}
+        return {"Y", "RY", "BY"} <= set(self.channels)
 
 
 def read_exr_parts(path: Path, file: IO[bytes]) -> tuple[ExrPart, ...]:
@@ -160,13 +154,13 @@ def _part(path: Path, index: int, attributes: dict[str, bytes]) -> ExrPart:
         raise _damaged(path, f"part {index} without a usable {error}") from error
 
 
-def _channels(path: Path, content: bytes) -> tuple[ExrChannel, ...]:
-    channels: list[ExrChannel] = []
+def _channels(path: Path, content: bytes) -> tuple[str, ...]:
+    """Names in a list of channels, each followed by 16 bytes of type and sampling."""
+    channels: list[str] = []
     position = 0
     while content[position : position + 1] not in (b"\0", b""):
         name, position = _text(path, content, position)
-        _, _, across, down = struct.unpack_from("<iiii", content, position)
-        channels.append(ExrChannel(name, (across, down)))
+        channels.append(name)
         position += 16
         if len(channels) > MOST_CHANNELS:
             raise CaptureError(

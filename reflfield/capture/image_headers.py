@@ -19,7 +19,7 @@ from typing import IO
 from reflfield.capture.exr_headers import ExrPart, read_exr_parts
 from reflfield.capture.tiff_headers import (
     TiffPage,
-    exif_orientation,
+    exif_facts,
     raw_evidence,
     read_tiff_pages,
 )
@@ -94,6 +94,8 @@ class ImageHeader:
         How a viewer would turn the image (Exif, 1 to 8); the pixels stay as they are.
     alpha : bool
         Of a PNG or TIFF: whether there is an alpha channel.
+    adobe_rgb : bool
+        Of a JPEG: whether Exif data say Adobe RGB, as cameras do without a profile.
     chunks : dict of bytes to bytes
         Of a PNG: names of the chunks before the image, with the content of `PNG_CHUNKS`.
     lines : tuple of str
@@ -109,6 +111,7 @@ class ImageHeader:
     height: int
     orientation: int = 1
     alpha: bool = False
+    adobe_rgb: bool = False
     chunks: dict[bytes, bytes] = field(default_factory=dict)
     lines: tuple[str, ...] = ()
     parts: tuple[ExrPart, ...] = ()
@@ -247,7 +250,7 @@ def _png(path: Path, file: IO[bytes]) -> ImageHeader:
         chunks[name] = file.read(kept)
         file.seek(length - kept + 4, os.SEEK_CUR)  # and the checksum
     width, height = struct.unpack(">II", chunks.get(b"IHDR", b"")[:8])
-    orientation = exif_orientation(path, chunks.get(b"eXIf", b""))
+    orientation, _ = exif_facts(path, chunks.get(b"eXIf", b""))
     colour_type = chunks[b"IHDR"][9]
     alpha = colour_type in (4, 6) or b"tRNS" in chunks
     return ImageHeader("png", width, height, orientation, alpha, chunks=chunks)
@@ -281,7 +284,7 @@ def check_png(path: Path) -> None:
 def _jpeg(path: Path, file: IO[bytes]) -> ImageHeader:
     """Width and height stand in the frame segment, behind others of any length."""
     file.seek(2)
-    orientation = 1
+    orientation, adobe_rgb = 1, False
     for _ in range(MOST_JPEG_SEGMENTS):
         fill, marker = struct.unpack("BB", file.read(2))
         while marker == 0xFF:  # fill bytes
@@ -296,10 +299,10 @@ def _jpeg(path: Path, file: IO[bytes]) -> ImageHeader:
                     f"{path}: expected a JPEG of 8 bits, grey or RGB, received {precision} "
                     f"bits and {channels} channels; export it again"
                 )
-            return ImageHeader("jpeg", width, height, orientation)
+            return ImageHeader("jpeg", width, height, orientation, adobe_rgb=adobe_rgb)
         content = file.read(length - 2) if marker == 0xE1 else b""
         if content[:6] == b"Exif\0\0":
-            orientation = exif_orientation(path, content[6:])
+            orientation, adobe_rgb = exif_facts(path, content[6:])
         file.seek(length - 2 - len(content), os.SEEK_CUR)
     raise CaptureError(
         f"{path}: expected a JPEG image, received one without a frame; is it whole?"

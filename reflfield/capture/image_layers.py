@@ -102,12 +102,12 @@ def _layers(part: ExrPart, header: ImageHeader) -> list[Layer]:
     channels: dict[str, dict[str, str]] = {}
     if part.luminance_chroma:
         channels[""] = {"r": "R", "g": "G", "b": "B"}  # what the decoder makes of it
-        if "A" in {channel.name for channel in part.channels}:
+        if "A" in part.channels:
             channels[""]["a"] = "A"
     else:
-        for channel in part.channels:
-            prefix, _, letter = channel.name.rpartition(".")
-            channels.setdefault(prefix, {})[letter.lower()] = channel.name
+        for name in part.channels:
+            prefix, _, letter = name.rpartition(".")
+            channels.setdefault(prefix, {})[letter.lower()] = name
     layers = []
     for prefix, names in channels.items():
         colour = _colour(names)
@@ -168,7 +168,7 @@ def _doubt(
 ) -> CaptureError:
     names = [layer.name for layer in layers]
     shown = ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
-    channels = sorted({channel.name for part in header.parts for channel in part.channels})
+    channels = sorted({name for part in header.parts for name in part.channels})
     if not names:
         listed = ", ".join(channels[:MOST_LISTED])
         return CaptureError(

@@ -67,7 +67,7 @@ def _write(path: Path, partial: Path, spec: Any, pixels: NDArray[Any]) -> None:
         closed = file.close()
     error = file.geterror() + oiio.geterror()
     if not (written and closed) or error:
-        text = " ".join(error.replace(str(partial), "").split())
+        text = " ".join(error.replace(f'to image file "{partial}"', "").split())
         reason = f"the image could not be written ({text}); is the disk full?"
         raise OSError(errno.EIO, reason, str(path))
 

@@ -39,7 +39,6 @@ def stated_space(
     part: int,
     *,
     profile: bytes,
-    adobe_rgb: bool,
     is_float: bool,
 ) -> ColorSpace:
     """The colour space that a file states; sRGB for integers and linear for floats by default.
@@ -53,8 +52,6 @@ def stated_space(
         Part or page that is read.
     profile : bytes
         The ICC profile of a JPEG or TIFF, or nothing.
-    adobe_rgb : bool
-        Whether Exif data say Adobe RGB, as cameras write it without a profile.
     is_float : bool
         Whether the file holds floats.
 
@@ -76,7 +73,7 @@ def stated_space(
             return _png_space(header.chunks)
         if profile:
             return _profile_space(profile)
-        if adobe_rgb:
+        if header.adobe_rgb:
             return ColorSpace(
                 Encoding("gamma", gamma=ADOBE_GAMMA), rec709_from_primaries(ADOBE_RGB)
             )

@@ -6,6 +6,7 @@ import io
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -22,6 +23,8 @@ MOST_VALUES = 1024
 SUBFILE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC = 254, 256, 257, 258, 259, 262
 SAMPLES, TILE_WIDTH, TILE_HEIGHT, FORMAT, SUB_DIRECTORIES = 277, 322, 323, 339, 330
 PAGE_NAME, TRANSFER, WHITE, PRIMARIES, ORIENTATION, EXTRA = 285, 301, 318, 319, 274, 338
+# Of Exif data: the directory of the camera's settings, the one of interoperability, its index.
+EXIF, INTEROPERABILITY, INDEX = 34665, 40965, 1
 DNG_VERSION = 50706
 COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
 # NEF, ARW, PEF and others compress mosaics in ways of their own.
@@ -31,6 +34,7 @@ RAW_COMPRESSIONS = (32767, 32769, 34713, 65000, 65535)
 READ = {
     *(SUBFILE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES, TILE_WIDTH, TILE_HEIGHT),
     *(FORMAT, SUB_DIRECTORIES, PAGE_NAME, WHITE, PRIMARIES, ORIENTATION, EXTRA),
+    *(EXIF, INTEROPERABILITY, INDEX),
 }
 
 _TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "B", 8: "h", 9: "i", 10: "ii"}
@@ -150,12 +154,27 @@ def raw_evidence(path: Path) -> str:
     return ""
 
 
-def exif_orientation(path: Path, exif: bytes) -> int:
-    """How a viewer turns an image, 1 to 8, by the Exif data (a TIFF) of another format."""
+def exif_facts(path: Path, exif: bytes) -> tuple[int, bool]:
+    """What the Exif data (a TIFF) of an image of another format say.
+
+    Returns
+    -------
+    orientation : int
+        How a viewer turns the image, 1 to 8; 1 is not at all.
+    adobe_rgb : bool
+        Whether the camera wrote Adobe RGB (interoperability index R03).
+    """
     if exif[:4] not in (b"II*\0", b"MM\0*"):
-        return 1
-    tags = next(_directories(path, io.BytesIO(exif)), {})
-    return int(_first(tags, ORIENTATION, 1))
+        return 1, False
+    file, orientation, adobe_rgb = io.BytesIO(exif), 1, False
+    with suppress(CaptureError, struct.error, ValueError):  # the pixels may be sound
+        inner = next(_directories(path, file), {})
+        orientation = _first(inner, ORIENTATION, 1)
+        for pointer in (EXIF, INTEROPERABILITY):
+            position = _first(inner, pointer, 0)
+            inner = next(_directories(path, file, position), {}) if position else {}
+        adobe_rgb = bytes(int(n) for n in inner.get(INDEX, ()))[:3] == b"R03"
+    return orientation, adobe_rgb
 
 
 def _directories(path: Path, file: IO[bytes], first: int | None = None) -> Iterator[Tags]:

@@ -151,6 +151,17 @@ class TestProfiles:
         tolerance = 0.02 if suffix == "jpg" else 2e-4
         np.testing.assert_allclose(read_image(path)[4, 4::8], expected[0], atol=tolerance)
 
+    def test_adobe_rgb_of_a_camera_that_writes_no_profile(self, tmp_path):
+        picture = Image.fromarray(np.repeat(STORED, 8, 0).repeat(8, 1))
+        exif = picture.getexif()
+        settings = exif.get_ifd(0x8769)
+        settings[0xA001], settings[0xA005] = 65535, {1: "R03"}
+        path = tmp_path / "a.jpg"
+        picture.save(path, exif=exif, quality=100, subsampling=0)
+        expected = SHARES ** (563 / 256) @ rec709_from_primaries(ADOBE_RGB).T
+        # a JPEG's codes are off by up to two
+        np.testing.assert_allclose(read_image(path)[4, 4::8], expected[0], atol=0.02)
+
     @pytest.mark.parametrize("suffix", ["png", "tif"])
     def test_srgb_profiles_are_srgb_exactly(self, tmp_path, suffix):
         made = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

@@ -203,6 +203,16 @@ class TestOrientation:
         assert image[:, :2].max() < 0.1
         assert image[:, 4:].min() > 0.9
 
+    @pytest.mark.parametrize(
+        "exif", [b"II*\0", b"II*\0\x08\0\0\0\xff\xff", b"MM\0*" + b"\xff" * 90]
+    )
+    def test_garbled_exif_data_leave_the_pixels_sound(self, tmp_path, exif):
+        Image.new("RGB", (8, 8), (255, 255, 255)).save(
+            tmp_path / "a.jpg", exif=b"Exif\0\0" + exif
+        )
+        assert image_orientation(tmp_path / "a.jpg") == 1
+        np.testing.assert_array_equal(read_image(tmp_path / "a.jpg"), np.ones((8, 8, 3)))
+
     def test_no_statement_is_upright(self, tmp_path):
         Image.new("RGB", (3, 2)).save(tmp_path / "a.jpg")
         assert image_orientation(tmp_path / "a.jpg") == 1
