@@ -11,11 +11,12 @@ import sys
 
 import numpy as np
 import pytest
-from reflfield.capture.images import read_coverage, write_exr, write_png
 from rich.console import Console
 
 import reflfield as package
 import reflfield.cli as cli
+from reflfield.capture.image_files import read_coverage
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.comparison.metrics import object_pixels
 from reflfield.errors import InputError
 from reflfield.progress import ProgressLines, listening, report

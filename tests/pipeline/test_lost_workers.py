@@ -97,12 +97,12 @@ class CountedRun:
         return {path.parent.name: json.loads(path.read_text()) for path in paths}
 
     def digests(self):
-        """Of the field and of all files of the stages but their records, which hold times."""
+        """Of the field and of all files of the stages but records, which hold times."""
         paths = [self.out / "field.rfld", *self.out.glob("stages/**/*")]
         return {
             str(path.relative_to(self.out)): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in paths
-            if path.is_file() and path.name not in ("stage.json", ".lock")
+            if path.is_file() and path.name not in ("stage.json", "files.json", ".lock")
         }
 
 
