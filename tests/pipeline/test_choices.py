@@ -160,8 +160,8 @@ class TestWhatATrialLeaves:
         timings = json.loads((tried / "timings.json").read_text())
         assert timings["seconds"] == pytest.approx(sum(found.values()), rel=1e-9)
         # Before what is open, for each visibility (and what its shadows show, if they are
-        # traced), for each fit in it, the report.
-        assert len(found) == 5 + 2 * 3 + 1 + 4 * 2 + 1
+        # traced), for each fit in it, the maps and the report.
+        assert len(found) == 6 + 2 * 3 + 1 + 4 * 2 + 2
 
     def test_options_are_as_asked_with_what_was_taken_above(self, tried):
         text = (tried / "options.toml").read_text()
@@ -241,7 +241,7 @@ def test_no_trial_before_it_matters(tried_copy, run_open):
         tried_copy, "resampling.visibility=kept", "compression.fit=auto", last="resampling"
     )
     assert not (tried_copy / "trials").exists()
-    assert "# " not in (tried_copy / "options.toml").read_text()
+    assert "took" not in (tried_copy / "options.toml").read_text()
 
 
 def test_without_frames_the_number_of_samples_decides_and_says_so(run_open, tmp_path):
@@ -254,6 +254,27 @@ def test_without_frames_the_number_of_samples_decides_and_says_so(run_open, tmp_
     (note,) = [n for n in (tmp_path / "options.toml").read_text().splitlines() if "# " in n]
     assert '"auto" took "samples": no frames are held out' in note
     assert not (tmp_path / "trials").exists()
+
+
+def test_photographs_held_out_one_by_one_decide_too(run_open, tmp_path, tiny_capture):
+    kept = ("resampling.visibility=kept", OPEN[1])
+    held = HoldOut(photographs=3)
+    job = run_open(tmp_path, *kept, hold_out=held, last="compression")
+    psnr = {}
+    for name in ("samples", "grid"):
+        compared = tmp_path / "stages" / "choices" / name / "heldout.json"
+        frames = json.loads(compared.read_text())["frames"]
+        assert [f["name"] for f in frames] == [p.name for p in job.held_frames.photographs]
+        psnr[name] = [frame["psnr_ldr"] for frame in frames]
+        assert len(psnr[name]) == 3
+    # None of the three has made any of the fields: 57 of 60 have.
+    used = {p.path for p in job.training.photographs}
+    assert len(used) == 57
+    assert used.isdisjoint(p.path for p in job.held_frames.photographs)
+    first = choices.candidates(replace(job, options=job.asked_options))[0].fit
+    second = "grid" if first == "samples" else "samples"
+    ordered = {name: psnr[name] for name in (first, second)}
+    assert job.options.compression.fit == choices.clearly_best(ordered)
 
 
 def test_without_frames_to_compare_on_it_is_refused(run_tiny, tmp_path, tiny_capture):
