@@ -176,9 +176,7 @@ def _plain(entry: Any) -> Any:
     return entry.item() if isinstance(entry, np.generic) else entry
 
 
-def bounded(
-    default: Any, *, low: float = -LARGEST_NUMBER, high: float = LARGEST_NUMBER
-) -> Any:
+def bounded(default: Any, *, low: float = -LARGEST_NUMBER, high: float = LARGEST_NUMBER) -> Any:
     """Field of an options dataclass: a number, whole number or tuple of numbers in a range.
 
     Parameters

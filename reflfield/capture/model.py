@@ -273,7 +273,8 @@ class Capture:
         if not (coverage > 0.5).any():
             raise CaptureError(
                 f"{what}: empty silhouette: no pixel of view {camera.id!r} is covered, the "
-                f"largest value is {_in_codes(float(coverage.max()))}; white must mean object"
+                f"largest value is {round(255 * float(coverage.max()))} of 255; "
+                "white must mean object"
             )
         return coverage
 
@@ -437,10 +438,6 @@ def _sampled(capture: Capture, view: int) -> list[int]:
     indices = [i for i, p in enumerate(capture.photographs) if p.camera == view]
     step = -(-len(indices) // SILHOUETTE_SAMPLE) or 1
     return indices[::step]
-
-
-def _in_codes(value: float) -> str:
-    return f"{round(255 * value)} of 255"
 
 
 def _check_indices(photograph: Photograph, n_views: int, n_lights: int) -> None:
