@@ -17,6 +17,7 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -157,7 +158,7 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
         )
     if others := foreign_files(folder):
         shown = ", ".join(repr(name) for name in others[:3])
-        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        more = " and more" if len(others) > 3 else ""
         raise scene_error(
             str(folder),
             "an empty folder or an earlier capture of capture-sim with nothing else in it",
@@ -170,21 +171,23 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
         )
 
 
-def foreign_files(folder: Path) -> list[str]:
+def foreign_files(folder: Path, most: int = 4) -> list[str]:
     """Files in a folder that are not those of a capture as this program wrote them.
 
     Parameters
     ----------
     folder : Path
+    most : int
+        No more are looked for.
 
     Returns
     -------
     list of str
-        Relative paths, sorted; links, pipes and the like count, too.
+        Relative paths; links, pipes and the like count, too.
     """
     listed = _listed(folder)
     own = _OF_THE_WORK if listed else ()
-    others = [
+    others = (
         name
         for name, status in _entries(folder)
         if name not in own
@@ -193,8 +196,8 @@ def foreign_files(folder: Path) -> list[str]:
             and name in listed
             and listed[name] in (None, status.st_size)
         )
-    ]
-    return sorted(others)
+    )
+    return list(islice(others, most))
 
 
 def _entries(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
@@ -202,10 +205,12 @@ def _entries(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
     for root, folders, files in os.walk(folder):
         if Path(root) == folder and INSIDE in folders:
             folders.remove(INSIDE)
+        folders.sort()
         links = [name for name in folders if (Path(root) / name).is_symlink()]
-        for name in [*files, *links]:
+        for name in sorted([*files, *links]):
             path = Path(root) / name
-            yield path.relative_to(folder).as_posix(), path.lstat()
+            if os.path.lexists(path):
+                yield path.relative_to(folder).as_posix(), path.lstat()
 
 
 def _listed(folder: Path) -> dict[str, int | None]:

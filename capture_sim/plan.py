@@ -30,7 +30,7 @@ from capture_sim.truth import write_view_truth
 TRIAL_VIEWS = 3
 TRIAL_LIGHTS = 6
 # Pixels along the larger side of the images that are tried; counts grow with the pixels.
-TRIAL_SIDE = 1024
+TRIAL_SIDE = 512
 
 Table = Mapping[str, Any]
 Result = TypeVar("Result")
