@@ -64,6 +64,7 @@ LayerOption = Annotated[
     typer.Option(metavar="NAME", help="Layer, part or page of the photographs' files."),
 ]
 Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
+MaxMemory = Annotated[str, typer.Option(help="Ceiling of resident memory.")]
 Samples = Annotated[int, typer.Option(help="Rays per pixel, a square number.")]
 
 
@@ -212,7 +213,7 @@ def run(
     ] = None,
     until: Annotated[str, typer.Option(metavar="STAGE", help="Stop after this.")] = "report",
     workers: Workers = 0,
-    max_memory: Annotated[str, typer.Option(help="Ceiling of resident memory.")] = "4GB",
+    max_memory: MaxMemory = "4GB",
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Of a dask cluster that computes the blocks."),
@@ -289,12 +290,13 @@ def relight(
         float | None, typer.Option(help="Of the turntable's camera, degrees; 20.")
     ] = None,
     workers: Workers = 0,
+    max_memory: MaxMemory = "4GB",
     format: Format = None,
     follow_links: FollowLinks = False,
 ) -> None:
     """Render frames, or a turntable under an environment map or a distant light."""
     from reflfield.field.file import open_field
-    from reflfield.relighting.renderer import RenderOptions
+    from reflfield.steps.turntables import TurntableLighting, write_turntable
 
     if (frames is None) == (orbit is None):
         raise InputError("relight: expected either --frames FRAMES or --orbit N, one of them")
@@ -304,18 +306,28 @@ def relight(
                 "--elevation": elevation}  # fmt: skip
     refuse_without("--orbit; frames bring their own cameras and lights", orbit, of_orbit)
     refuse_without("--environment MAP", environment, of_map)
-    options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
+    limits = picture_limits(samples, workers, max_memory)
     opened = open_field(field)
     with showing_progress():
         if frames is not None:
             reading = {"format": format, "follow_links": follow_links}
-            made = relight_to(opened, frames, out, options, reading)
+            made = relight_to(opened, frames, out, limits, reading)
         else:
-            lights = turntable_lights(opened.up, environment, light, of_map)
+            turn = (environment_up, environment_rotation)
+            lighting = TurntableLighting(environment, light, convention, *turn)
             chosen = {"n_frames": orbit, "size": size, "elevation_deg": elevation}
-            made = orbit_to(opened, lights, out, options, chosen)
+            made = write_turntable(opened, lighting, out, limits[0], limits[1], chosen)
     for path in made:
         say(str(path))
+
+
+def picture_limits(samples: int, workers: int, max_memory: str) -> Any:
+    """Options of pictures, and what they may use."""
+    from reflfield.config import Resources, parse_bytes
+    from reflfield.relighting.renderer import RenderOptions
+
+    resources = Resources(n_workers(workers), parse_bytes(max_memory))
+    return RenderOptions(samples_per_pixel=samples, workers=resources.workers), resources
 
 
 def refuse_without(needed: str, value: Any, options: dict[str, Any]) -> None:
@@ -326,67 +338,15 @@ def refuse_without(needed: str, value: Any, options: dict[str, Any]) -> None:
 
 
 def relight_to(
-    field: Any, frames: Path, out: Path, options: Any, reading: dict[str, Any]
+    field: Any, frames: Path, out: Path, limits: Any, reading: dict[str, Any]
 ) -> list[Path]:
     """Relight frames; their EXR files."""
     from reflfield.capture.readers import open_capture
+    from reflfield.steps.memory import check_frames_memory
     from reflfield.steps.standalone import write_relit_frames
 
     opened = open_capture(frames, require_photographs=False, **reading)
-    return write_relit_frames(field, opened, out, options)
-
-
-def turntable_lights(
-    up: Any, environment: Path | None, light: str | None, of_map: dict[str, Any]
-) -> Any:
-    """What lights the turntable: a map, turned to an up direction, or one distant light."""
-    import numpy as np
-
-    from reflfield.capture.lights import Light
-    from reflfield.relighting.environment import EnvironmentMap
-
-    if (environment is None) == (light is None):
-        raise InputError("relight --orbit: expected either --environment MAP or --light X,Y,Z")
-    if environment is None:
-        towards = direction_of("--light", str(light))
-        power = np.full(3, np.pi)
-        return Light("turntable", "directional", direction=towards, intensity=power)
-    convention, zenith, rotation = of_map.values()
-    sky = EnvironmentMap.open(environment, convention or "openexr")
-    return sky.turned_to(
-        up if zenith is None else direction_of("--environment-up", zenith, axes=True),
-        rotation or 0.0,
-    )
-
-
-def direction_of(option: str, text: str, *, axes: bool = False) -> Any:
-    """Unit direction of ``x,y,z``, or of an axis such as ``-Y`` where `axes` allows it."""
-    from reflfield.checks import unit_direction
-
-    sign, axis = (-1.0 if text.strip().startswith("-") else 1.0), text.strip().lstrip("+-")
-    if axes and axis.upper() in ("X", "Y", "Z"):
-        return unit_direction(option, [sign * (axis.upper() == name) for name in "XYZ"])
-    try:
-        return unit_direction(option, [float(part) for part in text.split(",")])
-    except ValueError:
-        words = "X, Y, Z, -X, -Y, -Z or x,y,z" if axes else "X,Y,Z"
-        raise InputError(
-            f"{option}: expected {words} of finite numbers, not all zero, received {text!r}"
-        ) from None
-
-
-def orbit_to(
-    field: Any, lights: Any, out: Path, options: Any, chosen: dict[str, Any]
-) -> list[Path]:
-    """Render a turntable; animation and contact sheet."""
-    from reflfield.files import filling
-    from reflfield.relighting.orbit import OrbitOptions, render_orbit
-
-    stated = {name: value for name, value in chosen.items() if value is not None}
-    orbit = OrbitOptions(up=tuple(field.up.tolist()), **stated)
-    with filling(out) as partial:
-        made = render_orbit(field, lights, partial, orbit, options)
-    return [out / path.relative_to(partial) for path in (made.animation, made.contact_sheet)]
+    return write_relit_frames(field, opened, out, check_frames_memory(field, opened, *limits))
 
 
 @app.command()
@@ -396,6 +356,7 @@ def compare(
     out: Out,
     samples: Samples = 16,
     workers: Workers = 0,
+    max_memory: MaxMemory = "4GB",
     format: Format = None,
     follow_links: FollowLinks = False,
     encoding: EncodingOption = None,
@@ -404,13 +365,14 @@ def compare(
     """Relight frames and measure them against their photographs."""
     from reflfield.capture.readers import open_capture
     from reflfield.field.file import open_field
-    from reflfield.relighting.renderer import RenderOptions
+    from reflfield.steps.memory import check_frames_memory
     from reflfield.steps.standalone import write_standalone_comparison
 
-    options = RenderOptions(samples_per_pixel=samples, workers=n_workers(workers))
+    limits = picture_limits(samples, workers, max_memory)
     opened, reading = open_field(field), image_reading(encoding, layer)
     with showing_progress():
         photographed = open_capture(frames, format, follow_links=follow_links, reading=reading)
+        options = check_frames_memory(opened, photographed, *limits, compared=True)
         comparison = write_standalone_comparison(opened, photographed, out, options)
     say_metrics(comparison.to_dict())
     say(f"metrics   {out / 'metrics.json'}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,6 @@ from reflfield.comparison.truth import (
     open_truth,
     surface_points,
 )
-from reflfield.config import Resources
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.field.model import ReflectanceField
@@ -43,10 +42,10 @@ from reflfield.observations.resampling import (
     local_directions,
     unroot,
 )
-from reflfield.relighting.renderer import RenderOptions
 from reflfield.sphere.hemisphere import softened_cosine
 from reflfield.steps.holding_out import held_out_counts
 from reflfield.steps.job import Job
+from reflfield.steps.memory import within_memory
 
 # Texels farther from a true surface point than this many texel spacings see another part.
 MATCH_SPACINGS = 2.0
@@ -116,18 +115,6 @@ def variants(job: Job) -> dict[str, str]:
     if job.options.compares_without_alignment:
         stages[WITHOUT] = "without_alignment"
     return stages
-
-
-# Memory of one ray through a pixel: hits, footprints of up to twelve texels, radiance.
-RAY_BYTES = 4096
-
-
-def within_memory(options: RenderOptions, resources: Resources) -> RenderOptions:
-    """Blocks of pixels that all threads together can work on; the pictures stay the same."""
-    each = RAY_BYTES * options.samples_per_pixel
-    workers = options.workers or resources.workers
-    fits = max(4 * resources.block_bytes // (workers * each), 64)
-    return replace(options, workers=workers, block_pixels=min(options.block_pixels, fits))
 
 
 def frame_sets(job: Job) -> dict[str, Capture]:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from reflfield.capture.image_files import image_size
+from reflfield.capture.model import Capture
 from reflfield.config import Resources, gigabytes
 from reflfield.errors import InputError
+from reflfield.field.model import ReflectanceField
 from reflfield.observations.store import SAMPLE_BYTES, chunk_shape
+from reflfield.relighting.renderer import RenderOptions
 from reflfield.steps.columns import COLUMNS_AT_ONCE
 from reflfield.steps.job import Job
 
@@ -83,3 +89,114 @@ def writers_at_once(job: Job) -> int:
     each = views * n_texels * n_lights * SAMPLE_BYTES + job.resources.block_bytes
     free = job.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES
     return int(max(1, free // (WRITER_COPIES * each)))
+
+
+# --- pictures outside of a run -------------------------------------------------------------
+
+# A pixel of a picture while it is rendered and written: radiance, coverage, both, a copy.
+PICTURE_BYTES = 64
+# A pixel of a photograph beside it: as stored, linear, what of it is measured; the picture
+# read again, silhouette and masks.
+COMPARED_BYTES = 96
+# A pixel of a turntable's frame, all of which are kept: half floats, encoded, animated.
+FRAME_BYTES = 13
+# A pixel of an environment map while it is read.
+MAP_BYTES = 28
+# Texel of a field that is rendered, besides its components: frame, point, normal, owner.
+RENDERED_TEXEL_BYTES = 160
+
+
+def field_bytes(field: ReflectanceField, n_directions: int) -> int:
+    """Memory of a field, decoded for pictures, with its shadows under so many directions."""
+    shapes = {name: array.shape for name, array in field.arrays.items()}
+    n_clusters, n_functions, _ = shapes["function_factor"]
+    nodes = shapes["view_factor"][0] * shapes["light_factor"][0]
+    texel = RENDERED_TEXEL_BYTES + 8 * n_functions + n_directions // 8
+    # The table once as it is decoded and once as it is kept.
+    return 2 * 12 * n_clusters * nodes * n_functions + shapes["cluster"][0] * texel
+
+
+def check_picture_memory(
+    field: ReflectanceField,
+    resources: Resources,
+    options: RenderOptions,
+    *,
+    pixels: int,
+    pixel_bytes: int = PICTURE_BYTES,
+    kept_pixels: int = 0,
+    map_pixels: int = 0,
+) -> RenderOptions:
+    """Options with which pictures stay below a ceiling of memory; they look the same.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    resources : Resources
+    options : RenderOptions
+    pixels : int
+        Of the largest picture.
+    pixel_bytes : int
+        Memory of one of them.
+    kept_pixels : int
+        Of all frames of a turntable.
+    map_pixels : int
+        Of the largest environment map.
+
+    Returns
+    -------
+    RenderOptions
+        With blocks that all threads together can work on.
+
+    Raises
+    ------
+    InputError
+        If the ceiling cannot be met, naming what would suffice.
+    """
+    fitting = within_memory(options, resources)
+    blocks = fitting.workers * fitting.block_pixels * RAY_BYTES * options.samples_per_pixel
+    pictures = pixels * pixel_bytes + kept_pixels * FRAME_BYTES
+    directions = options.environment_directions if map_pixels else 0
+    least = BASE_BYTES + field_bytes(field, directions) + map_pixels * MAP_BYTES
+    least += blocks + pictures
+    if least > resources.max_memory:
+        frames = f" and {kept_pixels} in all" if kept_pixels else ""
+        received = gigabytes(resources.max_memory)
+        raise InputError(
+            f"--max-memory: expected at least {gigabytes(least + (1 << 26))} for pictures of "
+            f"{pixels} pixels{frames}, received {received}; raise it, or make the pictures, "
+            "their number or the map smaller"
+        )
+    return fitting
+
+
+def check_frames_memory(
+    field: ReflectanceField,
+    frames: Capture,
+    options: RenderOptions,
+    resources: Resources,
+    *,
+    compared: bool = False,
+) -> RenderOptions:
+    """`check_picture_memory` of the largest frame and map of some frames."""
+    maps = [s.file for light in frames.lights for s in light.sources if s.file is not None]
+    sizes = [image_size(path) for path in maps]
+    return check_picture_memory(
+        field,
+        resources,
+        options,
+        pixels=max((c.width * c.height for c in frames.cameras), default=0),
+        pixel_bytes=PICTURE_BYTES + compared * COMPARED_BYTES,
+        map_pixels=max((width * height for width, height in sizes), default=0),
+    )
+
+
+# Memory of one ray through a pixel: hits, footprints of up to twelve texels, radiance.
+RAY_BYTES = 4096
+
+
+def within_memory(options: RenderOptions, resources: Resources) -> RenderOptions:
+    """Blocks of pixels that all threads together can work on; the pictures stay the same."""
+    each = RAY_BYTES * options.samples_per_pixel
+    workers = options.workers or resources.workers
+    fits = max(4 * resources.block_bytes // (workers * each), 64)
+    return replace(options, workers=workers, block_pixels=min(options.block_pixels, fits))

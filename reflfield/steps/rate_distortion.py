@@ -23,9 +23,9 @@ from reflfield.steps.evaluation import (
     frame_sets,
     silhouettes_of_frames,
     variants,
-    within_memory,
 )
 from reflfield.steps.job import Job
+from reflfield.steps.memory import within_memory
 from reflfield.steps.quantising import FieldMaker
 
 # Steps over the residual of the fit.

@@ -20,9 +20,8 @@ from reflfield.steps.columns import (
     half_columns,
     texels_at_once,
 )
-from reflfield.steps.evaluation import within_memory
 from reflfield.steps.job import Job
-from reflfield.steps.memory import check_memory, least_memory
+from reflfield.steps.memory import check_memory, least_memory, within_memory
 from reflfield.steps.options import PipelineOptions, TextureOptions
 
 GB = 1 << 30
