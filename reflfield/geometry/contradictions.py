@@ -28,7 +28,7 @@ CONTRADICTION = 0.03
 # Voxels along the longest side of the box, as fine as pixels within these limits, and views
 # times voxels.
 _COARSEST = 32
-_FINEST = 96
+FINEST_VOTES = 96
 _MOST_TESTS = 25_000_000
 # Rays of all views together, and samples of them at a time.
 _RAYS = 20_000
@@ -161,8 +161,8 @@ def votes_of(views: Sequence[View], low: Array, high: Array) -> Votes:
     pixel = np.median(
         [view.distance_and_pixel(0.5 * (low + high)[None])[1][0] for view in views]
     )
-    useful = max(longest / max(float(pixel), longest / _FINEST), _COARSEST)
-    spacing = longest / min(_FINEST, int(affordable), int(useful))
+    useful = max(longest / max(float(pixel), longest / FINEST_VOTES), _COARSEST)
+    spacing = longest / min(FINEST_VOTES, int(affordable), int(useful))
     shape = tuple(int(n) for n in np.ceil((high - low) / spacing - 1e-9))
     centres = low + spacing * (np.indices(shape).reshape(3, -1).T + 0.5)
     excluded = np.zeros((len(views), len(centres)), dtype=bool)

@@ -23,6 +23,7 @@ from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.bounding_box import object_bounds
 from reflfield.geometry.carving import Grid, carve
 from reflfield.geometry.cones import View, measured_views
+from reflfield.geometry.contradictions import FINEST_VOTES
 from reflfield.geometry.disagreement import Contradiction, Disagreement
 from reflfield.geometry.explanations import (
     compared_pixels,
@@ -33,7 +34,7 @@ from reflfield.geometry.explanations import (
 )
 from reflfield.geometry.mesh import Mesh, decimate, keep_large_components, smooth
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.geometry.specks import specks_words, without_specks
+from reflfield.geometry.specks import noting_small_parts, specks_words, without_specks
 
 Array = NDArray[np.float64]
 
@@ -194,9 +195,10 @@ def visual_hull(
     options = options or HullOptions()
     views = measured_views(cameras, silhouettes)
     views, silhouettes, specks = without_specks(views, silhouettes)
-    outcome = _agreed_hull(views, silhouettes, options)
+    with noting_small_parts(views):
+        outcome = _agreed_hull(views, silhouettes, options)
     grid, mesh = outcome.carved.grid, outcome.carved.mesh
-    agreement = _agreement(mesh, cameras, silhouettes)
+    agreement = outcome.fit or _agreement(mesh, cameras, silhouettes)
     report = HullReport(
         spacing=grid.spacing,
         grid=grid.shape,
@@ -232,6 +234,7 @@ class _Outcome:
     contradictions: tuple[Contradiction, ...] = ()
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    fit: _Agreement | None = None
 
 
 def _carved(views: Sequence[View], options: HullOptions, tolerance: int) -> _Carved:
@@ -253,7 +256,7 @@ def _agreed_hull(
         carved, failure = None, error
     fit = None if carved is None else _agreement(carved.mesh, cameras, silhouettes)
     if carved is not None and fit is not None and not _suspicious(views, carved, fit):
-        return _Outcome(carved)
+        return _Outcome(carved, fit=fit)
     disagreement = Disagreement.of(views, options.bounds)
     if disagreement.outliers:
         usable = carved if fit is not None and np.median(fit.overlap) > _COLLAPSED else None
@@ -354,12 +357,15 @@ def _suspicious(views: Sequence[View], carved: _Carved, fit: _Agreement) -> bool
     """Whether a hull misses more of a silhouette than its voxels and blurred edges explain."""
     if fit.missing.max() > _SUSPICIOUS_IF_THIN:
         return True
-    centre = carved.mesh.bounds.mean(axis=0)[None]
+    bounds, spacing = carved.mesh.bounds, carved.grid.spacing
+    # Who disagrees is asked on a coarser grid, where less is seen.
+    spacing = max(spacing, float(np.ptp(bounds, axis=0).max()) / FINEST_VOTES)
+    centre = bounds.mean(axis=0)[None]
     for view, lost in zip(views, fit.lost, strict=True):
         some, _, _ = compared_pixels(view.camera)
         pixel = max(float(view.distance_and_pixel(centre)[1][0]), np.finfo(np.float64).tiny)
         depth = view.outline.values[some, some]
-        inner = lost & (depth > 1.0 + carved.grid.spacing / pixel)
+        inner = lost & (depth > 1.0 + spacing / pixel)
         if inner.sum() > _SUSPICIOUS * (depth > 0.0).sum():
             return True
     return False

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.names import listed
+from reflfield.errors import GeometryError
 from reflfield.geometry.bounding_box import robust_bounds
 from reflfield.geometry.cones import View
 from reflfield.geometry.contradictions import best_on_rays, best_score, votes_of
@@ -101,6 +103,22 @@ def specks_words(removed: Mapping[str, int]) -> tuple[str, ...]:
     return (
         f"{sum(removed.values())} {what} that no other view supports {were} left out: {shown}",
     )
+
+
+@contextmanager
+def noting_small_parts(views: Sequence[View]) -> Iterator[None]:
+    """Note on an error how many small parts the silhouettes have, if they have any."""
+    try:
+        yield
+    except GeometryError as error:
+        counts = {view.camera.id: _small_parts(view)[0] for view in views}
+        shown = [f"{name} {count}" for name, count in counts.items() if count]
+        if shown:
+            error.add_note(
+                "the silhouettes have small parts beside the object, as noise has "
+                f"({listed(shown)}); clean the masks"
+            )
+        raise
 
 
 def _small_parts(view: View) -> tuple[int, NDArray[np.int32]]:

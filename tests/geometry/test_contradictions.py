@@ -228,6 +228,15 @@ def test_specks_at_the_border_are_named_and_removed(rig):
     assert mesh.vertices.tobytes() == clean.vertices.tobytes()
 
 
+def test_noise_that_leaves_no_hull_is_named(rig, rng):
+    views, silhouettes = rig
+    noisy = [np.where(rng.random(s.shape) < 0.15, 1.0 - s, s) for s in silhouettes]
+    with pytest.raises(GeometryError) as caught:
+        visual_hull(views, noisy, COARSE)
+    assert "small parts beside the object" in caught.value.__notes__[0]
+    assert "v000 " in caught.value.__notes__[0]
+
+
 def test_small_parts_that_other_views_show_as_well_stay(rig):
     views, silhouettes = rig
     satellite = np.array([-0.75, -0.55, 0.1])
