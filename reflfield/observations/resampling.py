@@ -39,6 +39,8 @@ POWERS = {"cube_root": 3.0, "square_root": 2.0, "linear": 1.0}
 
 # A node with less than this summed interpolation weight was not observed.
 LEAST_SUPPORT = 0.1
+# What a node counts that was photographed but, being clipped, not measured.
+CONTINUED = 0.05
 # Sweeps that fill pairs never photographed before the separable solve.
 FILLING_SWEEPS = 4
 # A view this far below a texel's frame (sine of 12 degrees) tells of another surface.
@@ -656,7 +658,15 @@ def _pair_support(rooted: RootedSamples, to_views: Floats, to_lights: Floats) ->
         counted = counted * rooted.measured()
     support = apply_both(np.swapaxes(to_views, 1, 2), np.swapaxes(to_lights, 1, 2), counted)
     support = np.where(support < LEAST_SUPPORT, np.float32(0), support)
-    return support if rooted.has_gaps else support[..., 0]
+    if not rooted.has_gaps:
+        return support[..., 0]
+    # Where a photograph shows the texel but says too little, what its other samples continue to
+    # counts a little: of directions that are clipped on all texels nothing else is known.
+    known = np.asarray(counted.any(axis=(1, 2)))[:, None, None]
+    shown = (seen * rooted.pairs)[..., None]
+    reach = apply_both(np.swapaxes(to_views, 1, 2), np.swapaxes(to_lights, 1, 2), shown)
+    continued = CONTINUED * np.minimum(reach, np.float32(1.0)) * (reach >= LEAST_SUPPORT)
+    return np.maximum(support, continued * known).astype(np.float32)
 
 
 def apply_both(left: Floats, right: Floats, values: Floats) -> Floats:

@@ -11,9 +11,11 @@ from reflfield.observations.projection import directions_of, pairs_photographed
 from reflfield.observations.reading import LUMINANCE, NodeColumns, TexelReader, luminance_of
 from reflfield.observations.resampling import (
     CHANNEL_BITS,
+    CONTINUED,
     ResamplingOptions,
     local_directions,
     resample,
+    rooted_samples,
 )
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.sphere.hemisphere import softened_cosine
@@ -64,7 +66,7 @@ def reader_of(tmp_path, rng):
 def test_grey_under_coloured_lamps_is_grey(reader_of, n_lights, tolerance):
     """A third of each value would come out, were what a lamp lacks taken for black."""
     nodes = reader_of(4, n_lights, [0.3, 0.3, 0.3]).nodes(np.arange(N))
-    observed = nodes.weights > 0
+    observed = nodes.weights > CONTINUED
     assert observed.any(axis=(0, 1, 2)).all()
     # The prior draws what little is known a little to nothing: of one lamp at the horizon.
     np.testing.assert_allclose(nodes.values[observed] ** 3, 0.3, rtol=tolerance)
@@ -72,19 +74,19 @@ def test_grey_under_coloured_lamps_is_grey(reader_of, n_lights, tolerance):
 
 def test_node_is_observed_in_the_colours_of_the_lamps_near_it(reader_of):
     reader = reader_of(4, 3, [0.3, 0.2, 0.1])
-    rooted_samples = reader.rooted(np.arange(N))
+    read = reader.rooted(np.arange(N))
     weights = reader.nodes(np.arange(N)).weights
     assert weights.shape == (N, 9, 25, 3)
     for t, m, c in np.ndindex(N, 25, 3):
         # Lamp c is the only one of its colour.
-        near = rooted_samples.light_taps[1][t, c][rooted_samples.light_taps[0][t, c] == m]
-        lit = rooted_samples.light_weights[t, c] > 0
+        near = read.light_taps[1][t, c][read.light_taps[0][t, c] == m]
+        lit = read.light_weights[t, c] > 0
         # With that of the views, which is at most one: more than the least support.
-        share = near.sum() * rooted_samples.view_weights[t].sum()
+        share = near.sum() * read.view_weights[t].sum()
         if not lit or share < 0.1:
-            assert not weights[t, :, m, c].any()
+            assert weights[t, :, m, c].max() <= np.float32(CONTINUED)
         if lit and near.sum() > 0.5:
-            assert weights[t, :, m, c].any()
+            assert weights[t, :, m, c].max() > 2 * CONTINUED
 
 
 def test_columns_have_a_weight_for_each_row(reader_of):
@@ -102,6 +104,22 @@ def test_a_trace_of_gaps_leaves_a_weight_for_each_pair_of_nodes(reader_of):
     _, weights = NodeColumns(reader, np.arange(N)).read(np.array([3, 1]))
     least = reader.nodes(np.array([3, 1])).weights.min(axis=3)
     np.testing.assert_array_equal(weights.T.reshape(2, 9, 25), least)
+
+
+def test_what_is_clipped_everywhere_is_continued_and_counts_a_little(rng):
+    """Else nothing is known there, and a node that no texel observed would be black."""
+    whole = texel_samples(rng, 2, 6, 7, samples=np.full((2, 6, 7, 3), 0.3, np.float32))
+    samples = whole.samples.copy()
+    samples[:, :, :3, 1], samples[1, ..., 2] = np.nan, np.nan
+    frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
+    found = rooted_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
+    nodes = resample(found, (1, 5), 0.03)
+    weights = nodes.weights[:, 0]
+    zenith = 12  # of 5 x 5, amid the first lights
+    assert weights[0, zenith, 1] == np.float32(CONTINUED)
+    assert weights[0, zenith, 0] > 5 * CONTINUED
+    # The blue of the second texel was measured nowhere: nothing is continued.
+    assert not weights[1, :, 2].any()
 
 
 @pytest.mark.reference
