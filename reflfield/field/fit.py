@@ -40,6 +40,10 @@ USUAL_SIZE = 0.35
 LEAST_ENERGY = 1e-200
 
 
+# Largest values of options; beyond them a run takes days, or no machine holds the tables.
+MOST = {"rounds": 1000, "iterations": 10_000, "max_bytes": 1 << 40, "fineness": 16}
+
+
 @dataclass(frozen=True)
 class SampleFitOptions:
     """Effort and regularisation of the fit to the samples.
@@ -73,9 +77,12 @@ class SampleFitOptions:
     max_bytes: int = 192 << 20
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "iterations", "max_bytes", "fineness"):
-            if not 1 <= getattr(self, name) < np.inf:
-                raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
+        for name, most in MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise InputError(
+                    f"{name}: expected at least 1 and at most {most}, "
+                    f"received {getattr(self, name)}"
+                )
         if not self.smoothness >= 0:
             raise InputError(f"smoothness: expected >= 0, received {self.smoothness}")
         if not self.frame_spread_deg >= 0:

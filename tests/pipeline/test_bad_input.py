@@ -245,6 +245,7 @@ class TestOptions:
             ("alignment.iterations=0", ("alignment.iterations", "at least 1", "0")),
             ("alignment.band_limit=0", ("alignment.band_limit", "at least 1", "0")),
             ("completion.method=magic", ("completion.method", "'map' or 'brand'", "'magic'")),
+            ("compression.samples.fineness=1e300", ("samples.fineness", "at most 16", "1e")),
             ("compression.samples.rounds=0", ("compression.samples.rounds", "at least 1")),
             ("compression.training_texels=0", ("compression.training_texels", "at least 1")),
             ("texture.largest=0", ("texture.largest", "0")),

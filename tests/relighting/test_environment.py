@@ -407,3 +407,22 @@ def test_bad_maps_are_refused(tmp_path):
         EnvironmentMap.open(tmp_path / "none.exr")
     with pytest.raises(InputError, match="light 'a': expected an environment"):
         EnvironmentMap.of_light(Light("a", "directional"))
+
+
+def test_radiance_hdr_maps_are_read(tmp_path):
+    """Flat RGBE pixels, by the format: value (m + 1/2 or m) / 256 * 2 ** (e - 128)."""
+    pixels = np.zeros((4, 8, 4), np.uint8)
+    pixels[...] = (64, 128, 32, 130)  # mantissas over 256, times 4
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4 +X 8\n"
+    (tmp_path / "sky.hdr").write_bytes(head + pixels.tobytes())
+    total = EnvironmentMap.open(tmp_path / "sky.hdr").quantise(4).irradiances.sum(axis=0)
+    # Half a step of the smallest mantissa.
+    assert np.allclose(total, 4 * np.pi * np.array([1.0, 2.0, 0.5]), rtol=0.5 / 32 + 1e-6)
+
+
+def test_infinity_is_spoken_of_as_a_maps(tmp_path):
+    radiance = np.ones((4, 8, 3), np.float32)
+    radiance[1, 2] = np.inf
+    write_exr(tmp_path / "sky.exr", radiance)
+    with pytest.raises(CaptureError, match=r"sky\.exr: .*1 pixels.*repair or drop this env"):
+        EnvironmentMap.open(tmp_path / "sky.exr")
