@@ -73,16 +73,17 @@ class CompressionOptions:
             raise InputError(
                 f"fit: expected 'auto', 'samples' or 'grid', received {self.fit!r}"
             )
-        for name, least in (
-            ("n_clusters", 1),
-            ("n_components", 0),
-            ("rank", 1),
-            ("training_texels", 1),
-            ("size", 0),
+        for name, least, most in (
+            ("n_clusters", 1, 65_536),
+            ("n_components", 0, 1024),
+            ("rank", 1, 1024),
+            ("training_texels", 1, 1 << 24),
+            ("size", 0, 1 << 40),
         ):
-            if getattr(self, name) < least:
+            if not least <= getattr(self, name) <= most:
                 raise InputError(
-                    f"{name}: expected at least {least}, received {getattr(self, name)}"
+                    f"{name}: expected at least {least} and at most {most}, "
+                    f"received {getattr(self, name)}"
                 )
         if not 0 <= self.psnr < float("inf"):
             raise InputError(f"psnr: expected >= 0 dB, received {self.psnr}")

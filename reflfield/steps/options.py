@@ -66,9 +66,12 @@ class CompletionOptions:
     training_texels: int = 8192
 
     def __post_init__(self) -> None:
-        for name in ("rank", "passes", "training_texels"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
+        for name, most in (("rank", 1024), ("passes", 1000), ("training_texels", 1 << 24)):
+            if not 1 <= getattr(self, name) <= most:
+                raise InputError(
+                    f"{name}: expected at least 1 and at most {most}, "
+                    f"received {getattr(self, name)}"
+                )
         if self.method not in ("map", "brand"):
             raise InputError(f"method: expected 'map' or 'brand', received {self.method!r}")
 
