@@ -129,6 +129,7 @@ def check_photographs(capture: Capture) -> None:
         for exposure in photograph.exposures:
             size = image_size(exposure.path, exposure.reading)
             check_matches(exposure.path, camera, *size)
+    _check_files_once(capture)
     _check_orientations(capture)
     for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
         if path is not None:
@@ -148,6 +149,21 @@ def check_environments(capture: Capture) -> None:
             raise CaptureError(
                 f"{light.file}: environment map of light {light.id!r} missing; copy it there"
             )
+
+
+def _check_files_once(capture: Capture) -> None:
+    """Demand that no picture stands for two photographs, as of a list with a slip does."""
+    seen: dict[tuple[Path, str | None], str] = {}
+    for photograph in capture.photographs:
+        pair = (capture.cameras[photograph.camera].id, capture.lights[photograph.light].id)
+        words = f"camera {pair[0]!r} under light {pair[1]!r}"
+        for exposure in photograph.exposures:
+            key = (exposure.path, exposure.reading.layer)
+            if seen.setdefault(key, words) != words:
+                raise CaptureError(
+                    f"{exposure.path}: expected one photograph, received the same file for "
+                    f"{seen[key]} and for {words}; correct the name, or remove one of them"
+                )
 
 
 def _check_orientations(capture: Capture) -> None:

@@ -218,7 +218,7 @@ def _pixels(
     if stored_type == "uint":
         pixels = (pixels / (2**32 - 1)).astype(np.float32)
     if header.kind == "exr":
-        return _in_display_window(pixels, header, layer)
+        return _in_display_window(path, pixels, header, layer)
     if header.kind == "tiff" and _inverted(header, layer):
         top = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
         pixels = (top - pixels).astype(pixels.dtype)
@@ -233,8 +233,10 @@ def _inverted(header: ImageHeader, layer: Layer) -> bool:
     return page.photometric == 0 and page.bits > 8
 
 
-def _in_display_window(pixels: NDArray[Any], header: ImageHeader, layer: Layer) -> NDArray[Any]:
-    """Crop or pad (with 0) a data window to the display window."""
+def _in_display_window(
+    path: Path, pixels: NDArray[Any], header: ImageHeader, layer: Layer
+) -> NDArray[Any]:
+    """Crop or pad (with 0) a data window to the display window, which has a part of it."""
     display = header.parts[layer.part].display_window
     data = header.parts[layer.part].data_window
     if display == data:
@@ -242,10 +244,15 @@ def _in_display_window(pixels: NDArray[Any], header: ImageHeader, layer: Layer) 
     image = np.zeros((layer.height, layer.width, pixels.shape[2]), pixels.dtype)
     x0, y0 = max(display.left, data.left), max(display.top, data.top)
     x1, y1 = min(display.right, data.right) + 1, min(display.bottom, data.bottom) + 1
-    if x0 < x1 and y0 < y1:
-        image[y0 - display.top : y1 - display.top, x0 - display.left : x1 - display.left] = (
-            pixels[y0 - data.top : y1 - data.top, x0 - data.left : x1 - data.left]
+    if x0 >= x1 or y0 >= y1:
+        raise CaptureError(
+            f"{path}: expected pixels inside the display window {tuple(display)}, "
+            f"received the data window {tuple(data)}, which lies outside of it; "
+            "correct the windows"
         )
+    image[y0 - display.top : y1 - display.top, x0 - display.left : x1 - display.left] = pixels[
+        y0 - data.top : y1 - data.top, x0 - data.left : x1 - data.left
+    ]
     return image
 
 

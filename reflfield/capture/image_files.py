@@ -150,6 +150,22 @@ def read_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> Float32 |
     return None if alpha is None or not (alpha < 1).any() else alpha
 
 
+def largest_code_of_16(path: Path | str, reading: ImageReading = AS_STATED) -> int | None:
+    """Largest code of a file of 16 bits that is decoded by a curve which nobody asked for.
+
+    Returns
+    -------
+    int or None
+        None for other files, and for linear ones, which are right up to a scale.
+    """
+    if reading.encoding is not None:
+        return None
+    stored = _read(Path(path), reading)
+    if stored.colour.dtype != np.uint16 or stored.stated().encoding.name == LINEAR:
+        return None
+    return int(stored.colour.max(initial=0))
+
+
 def stores_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> bool:
     """Whether a file has an alpha channel, by its header; it may be opaque."""
     path = Path(path)

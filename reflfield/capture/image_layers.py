@@ -107,7 +107,7 @@ def _layers(part: ExrPart, header: ImageHeader) -> list[Layer]:
     else:
         for name in part.channels:
             prefix, _, letter = name.rpartition(".")
-            channels.setdefault(prefix, {})[letter.lower()] = name
+            channels.setdefault(prefix, {}).setdefault(letter.lower(), name)  # R before r
     layers = []
     for prefix, names in channels.items():
         colour = _colour(names)

@@ -203,7 +203,7 @@ def largest_gap(
 
 def _value_ranges(capture: Capture, sample: int) -> tuple[tuple[float, float, float], int, int]:
     """(smallest, 99th percentile, largest), negative values, photographs read."""
-    chosen = _spread(len(capture.photographs), sample)
+    chosen = spread_evenly(len(capture.photographs), sample)
     lows, highs, tops, n_negative = [], [], [], 0
     for index in track(chosen, len(chosen), "reading photographs"):
         image = capture.read_photograph(index)
@@ -222,14 +222,15 @@ def _silhouettes_else(capture: Capture) -> str:
 
 
 def _silhouette_coverage(capture: Capture, sample: int) -> Range | None:
-    chosen = [i for i in _spread(capture.n_views, sample) if capture.silhouettes[i] is not None]
+    shown = spread_evenly(capture.n_views, sample)
+    chosen = [i for i in shown if capture.silhouettes[i] is not None]
     if not chosen:
         return None
     shares = [float(capture.read_silhouette(view).mean()) for view in chosen]
     return min(shares), max(shares)
 
 
-def _spread(count: int, sample: int) -> list[int]:
+def spread_evenly(count: int, sample: int) -> list[int]:
     """At most `sample` of `count` indices, evenly spread."""
     n = min(count, sample)
     return [round(i * (count - 1) / max(n - 1, 1)) for i in range(n)]

@@ -27,6 +27,7 @@ from reflfield.errors import CaptureError
 
 SUFFIX = ".lp"
 IMAGE_WIDTH = 1.0  # metres
+MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearly level
 CAMERA_HEIGHT = 10.0  # metres above the plane; only a sign for an orthographic camera
 
 
@@ -67,6 +68,7 @@ def read_lp(
     parsed = [_parsed(line, description) for line in lines[1:]]
     paths = [files.path_by_last_parts(name) for name, _ in parsed]
     names = unique_names(paths, root)
+    notes = _behind([direction for _, direction in parsed], description)
     lights = tuple(
         Light(f"l{i:04d}", "directional", direction=np.array(direction))
         for i, (_, direction) in enumerate(parsed)
@@ -84,6 +86,24 @@ def read_lp(
         up=np.array([0.0, 1.0, 0.0]),
         format="lp",
         description=description,
+        notes=notes,
+    )
+
+
+def _behind(directions: list[list[float]], description: Path) -> tuple[str, ...]:
+    """A note on lights behind the image plane; many of them are of another convention."""
+    behind = sum(direction[2] <= 0 for direction in directions)
+    if behind > MOST_BEHIND * len(directions):
+        raise CaptureError(
+            f"{description}: expected light directions (x right, y up, z towards the camera) "
+            f"in front of the picture, z > 0, received {behind} of {len(directions)} with z <= 0; "
+            "do they have another axis towards the camera, or are they angles?"
+        )
+    if not behind:
+        return ()
+    return (
+        f"{description}: {behind} of {len(directions)} lights are behind the image plane "
+        "(z <= 0); their photographs show nothing of it",
     )
 
 

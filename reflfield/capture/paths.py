@@ -57,7 +57,8 @@ class NamedFiles:
         Raises
         ------
         CaptureError
-            If the path is absolute, leads outside, or holds control characters.
+            If the path leads outside, is absolute and no end of it names a file in a folder
+            here, or holds control characters.
         """
         key = (repr(text), *suffixes)
         if key not in self._answers:
@@ -66,6 +67,8 @@ class NamedFiles:
 
     def _sought(self, text: object, suffixes: Sequence[str]) -> Path:
         names = self._names(text)
+        below = self._below(names[-1], suffixes)
+        names = [below] if below else names
         for name in names:
             self._check_inside(name)
         tried = [name + suffix for suffix in ("", *suffixes) for name in names]
@@ -77,6 +80,24 @@ class NamedFiles:
             if other is not None:
                 return self._checked(other)
         return self._checked(names[-1] + (suffixes[0] if suffixes else ""))
+
+    def _below(self, name: str, suffixes: Sequence[str]) -> str | None:
+        """An absolute path as one below the folder; None if it names no file there.
+
+        The folder may have been moved or come from another computer: then the longest end of
+        the path counts that names a file, at least with its folder, since ``train/r_1.png``
+        and ``test/r_1.png`` are two.
+        """
+        if not _ABSOLUTE.match(name) or ".." in name.split("/"):
+            return None
+        for root in (self.root.absolute(), self._resolved_root):
+            if Path(name).is_relative_to(root):
+                return Path(name).relative_to(root).as_posix()
+        parts = [part for part in name.split("/") if part not in ("", ".")]
+        ends = ["/".join(parts[i:]) for i in range(len(parts) - 1) if ":" not in parts[i]]
+        return next(
+            (e for e in ends for s in ("", *suffixes) if (self.root / (e + s)).is_file()), None
+        )
 
     def path_by_last_parts(self, text: object) -> Path:
         """Path of a file that was moved here with some of its folders, or none.

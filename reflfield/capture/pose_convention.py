@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
 from reflfield.errors import CaptureError
@@ -24,6 +25,9 @@ LOOKS_AT = np.radians(30.0)
 # Share of the cameras' distance to the world's origin below which the common point lies in a
 # camera itself.
 NEAREST = 0.05
+# Share of that distance within which two cameras stand at one place. Inverted poses of cameras
+# on rings do, those of each ring in one point, and a few points always look at each other.
+SAME_PLACE = 0.01
 # Shares of the cameras that look at it: as described, and in the other convention.
 MOST_IF_MISTAKEN, LEAST_IF_MEANT = 0.5, 0.95
 
@@ -67,6 +71,8 @@ def check_poses(cameras: Sequence[Camera], description: object) -> None:
 def share_looking_inwards(camera_from_world: Array) -> float:
     """Share of cameras that look at the point nearest to all optical axes.
 
+    Cameras at the place of another one do not count: they say nothing of where an object is.
+
     Parameters
     ----------
     camera_from_world : (n, 4, 4) float64
@@ -92,4 +98,6 @@ def share_looking_inwards(camera_from_world: Array) -> float:
     towards = common - centres
     distance = np.linalg.norm(towards, axis=1)
     cosine = np.einsum("nj,nj->n", towards, forward) / np.maximum(distance, 1e-300)
-    return float(np.mean((distance > NEAREST * scale) & (cosine > np.cos(LOOKS_AT))))
+    apart = cKDTree(centres - common).query(centres - common, k=2)[0][:, 1]
+    alone = apart > SAME_PLACE * scale
+    return float(np.mean(alone & (distance > NEAREST * scale) & (cosine > np.cos(LOOKS_AT))))

@@ -54,7 +54,7 @@ _REFUSED = tuple(
         (r"[RT]_opt", "write the refined pose as 'transform_matrix'"),
         (r"crop\w*", "crop the photographs and shift cx and cy"),
         (r"img_path", "name the photograph in 'file_path'"),
-        (r"normal_mts_args|from_mitsuba", "write 'transform_matrix' in OpenGL axes"),
+        (r"normal_mts_args|from_mitsuba|from_na", "write 'transform_matrix' in OpenGL axes"),
         (r"white_transparent|black_transparent|fix_premult|sharpen|mask_color", _VALUES),
         (r"env_?map\w*|driver_parameters|lights?|light_\w+|pl_(?!pos|intensity)\w+", _LIGHT),
     )

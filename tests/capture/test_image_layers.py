@@ -43,6 +43,8 @@ class TestLayers:
             ([("N", "RGB"), ("beauty", "RGB")], 1),
             ([("N", "RGB"), ("RGBA", "rgba")], 1),
             ([("diffuse", "RGB"), ("Ci", "rgb")], 1),
+            # capital letters before small ones of one layer
+            ([("", "RGB"), ("", "rgb")], 0),
             # the only layer there is
             ([("anything", "RGB")], 0),
             ([("", "Y")], 0),

@@ -72,6 +72,19 @@ class TestExr:
         write_exr(tmp_path / "both.exr", stack, names)
         np.testing.assert_array_equal(read_image(tmp_path / "both.exr"), photograph)
 
+    def test_a_data_window_outside_of_the_display_window_is_refused(self, tmp_path):
+        """It shows nothing of the picture; black would count as measured."""
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "displayWindow": (np.array([0, 0], np.int32), np.array([3, 2], np.int32)),
+            "dataWindow": (np.array([10, 1], np.int32), np.array([11, 1], np.int32)),
+        }
+        channels = {name: np.array([[1, 2]], np.float32) for name in "RGB"}
+        OpenEXR.File(header, channels).write(str(tmp_path / "w.exr"))
+        with pytest.raises(CaptureError, match=r"w\.exr: .*\(0, 0, 3, 2\).*\(10, 1, 11, 1\)"):
+            read_image(tmp_path / "w.exr")
+
     def test_data_window_is_placed_in_the_display_window(self, tmp_path):
         header = {
             "compression": OpenEXR.ZIP_COMPRESSION,

@@ -64,3 +64,25 @@ def test_parallel_and_orthographic_cameras_are_left_alone(rng):
     poses[:, 0, 3] = np.arange(6)
     check_poses(cameras(poses), "capture.json")
     check_poses(cameras(inverted(dome(rng)), "orthographic"), "capture.json")
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (inverted, "exchanged in OpenCV axes"),
+        (lambda m: OPENGL @ m, "the camera axes are the other ones"),
+        (lambda m: OPENGL @ inverted(m), "exchanged in OpenCV axes"),
+    ],
+)
+def test_another_convention_of_cameras_on_rings_is_named(mistake, words):
+    # Inverted, the cameras of a ring stand in one point each, and three points look at each
+    # other: with that counted, the first passed and the second was called an exchange.
+    poses = [
+        looking_at((2 * np.cos(a) * np.cos(e), 2 * np.sin(a) * np.cos(e), 2 * np.sin(e)),
+                   (0.0, 0.0, 0.3), (0, 0, 1))
+        for e in np.radians([0.0, 25.0, 50.0])
+        for a in np.arange(6)
+    ]  # fmt: skip
+    check_poses(cameras(poses), "capture.json")
+    with pytest.raises(CaptureError, match=rf"18 cameras.*{words}"):
+        check_poses(cameras(mistake(np.array(poses))), "capture.json")

@@ -53,6 +53,26 @@ class TestLp:
             tmp_path / "right/1.png",
         ]
 
+    @pytest.mark.parametrize(
+        "lights",
+        [
+            ("0.6 0 -0.8", "0 0.6 -0.8", "0 0 -1"),  # z away from the camera
+            ("120 45 0", "240 45 0", "0 90 0"),  # angles in degrees
+            ("0.6 0.8 0", "0.6 -0.8 0", "0 1 0.1"),  # y towards the camera
+        ],
+    )
+    def test_lights_behind_the_picture_are_of_another_convention(self, tmp_path, lights):
+        photograph(tmp_path / "1.png")
+        with pytest.raises(CaptureError, match=r"dome\.lp: .*z > 0, received [23] of 3"):
+            self.opened(tmp_path, *(f"1.png {light}" for light in lights))
+
+    def test_few_lights_behind_the_picture_are_noted(self, tmp_path):
+        for i in range(8):
+            photograph(tmp_path / f"{i}.png")
+        lines = [f"{i}.png 0.6 0 {-0.1 if i == 3 else 0.8}" for i in range(8)]
+        note = self.opened(tmp_path, *lines).notes[0]
+        assert "dome.lp: 1 of 8 lights are behind the image plane" in note
+
     def test_nothing_of_the_name_here(self, tmp_path):
         photograph(tmp_path / "jpeg-exports/1.png")
         with pytest.raises(CaptureError, match=r"leaves the folder.*the description into a"):

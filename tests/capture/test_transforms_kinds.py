@@ -359,6 +359,22 @@ class TestFiles:
             opened(tmp_path, [frame(name)])
         assert str(caught.value).isprintable()
 
+    @pytest.mark.parametrize("suffix", [".exr", ""])
+    @pytest.mark.parametrize("root", ["{folder}/", "/home/me/vase/", "D:\\vase\\"])
+    def test_absolute_paths_of_this_folder_or_where_it_was(self, tmp_path, root, suffix):
+        for folder in ("train", "test"):
+            self.write(tmp_path / folder / "r_1.exr")
+        name = root.format(folder=tmp_path.absolute()) + "train/r_1" + suffix
+        capture = opened(tmp_path, [frame(name)])
+        assert capture.photographs[0].path == tmp_path / "train/r_1.exr"
+
+    def test_absolute_paths_of_another_folder_are_refused(self, tmp_path):
+        """The last part alone is no evidence: both splits have an r_1."""
+        self.write(tmp_path / "train/r_1.exr")
+        self.write(tmp_path / "r_1.exr")
+        with pytest.raises(CaptureError, match="leaves the folder"):
+            opened(tmp_path, [frame("/home/me/vase/test/r_1.exr")])
+
     def test_links_within_a_download_cache(self, tmp_path):
         """Every file of a snapshot is a link to a blob beside it, the description too."""
         snapshot, blobs = tmp_path / "snapshots/1", tmp_path / "blobs"

@@ -1,0 +1,67 @@
+"""Values of a capture that hint at another unit or another range than they are read in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reflfield.capture.cameras import ORTHOGRAPHIC
+from reflfield.capture.image_files import largest_code_of_16
+from reflfield.capture.inspect import object_centre, spread_evenly
+from reflfield.capture.lights import POINT, SPOT
+from reflfield.capture.model import Capture
+from reflfield.errors import CaptureError
+
+# 16-bit files that hold sensors' codes as they are have at most 12 bits set, one in sixteen of
+# the range; encoded photographs reach that in any that is not nearly black.
+TWELVE_BITS = 4095
+# Photographs that are looked into before all are taken to be so; the first one usually tells.
+_MOST_LOOKED_INTO = 8
+# A dome's lamps stand about as far from the object as its cameras.
+FARTHEST_LIGHTS = 100.0
+
+
+def check_code_range(capture: Capture) -> None:
+    """Refuse linear codes of 12 bits that would be read as a dark sRGB of 16 bits.
+
+    Raises
+    ------
+    CaptureError
+        If all photographs that are looked into are files of 16 bits without a code above
+        4095, and nobody says how they are encoded.
+    """
+    largest = 0
+    looked_into = spread_evenly(len(capture.photographs), _MOST_LOOKED_INTO)
+    for index in looked_into:
+        photograph = capture.photographs[index]
+        longest = max(photograph.exposures, key=lambda exposure: exposure.seconds)
+        code = largest_code_of_16(longest.path, longest.reading)
+        if code is None or code > TWELVE_BITS:
+            return
+        largest = max(largest, code)
+    if looked_into:
+        raise CaptureError(
+            f"{capture.photographs[0].path}: expected 16-bit photographs that use their range, "
+            f"received codes up to {largest} in all that were looked into "
+            f"({len(looked_into)}), as of a sensor of 12 bits; say --encoding linear if they "
+            "are a sensor's values, --encoding srgb if they are encoded and so dark"
+        )
+
+
+def far_lights(capture: Capture) -> tuple[str, ...]:
+    """A note on lights that are much farther away than cameras, as in another unit."""
+    centre = object_centre(capture)
+    cameras = [c.centre for c in capture.cameras if c.kind != ORTHOGRAPHIC]
+    lights = [light.position for light in capture.lights if light.kind in (POINT, SPOT)]
+    if len(cameras) < 2 or not lights:  # of one nothing is known but where it looks
+        return ()
+    near, far = (
+        float(np.median(np.linalg.norm(np.array(points) - centre, axis=1)))
+        for points in (cameras, lights)
+    )
+    if near == 0 or far <= FARTHEST_LIGHTS * near:
+        return ()
+    return (
+        f"{capture.description}: lights are {far / near:.3g} times as far from what the "
+        f"cameras look at as these are (medians {far:.3g} and {near:.3g}); are both in one "
+        "unit?",
+    )

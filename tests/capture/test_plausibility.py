@@ -1,0 +1,107 @@
+"""Captures in another unit or range than they would be read in are refused or noted."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reflfield.capture.encoding import parse_encoding
+from reflfield.capture.image_files import ImageReading, read_image
+from reflfield.capture.readers import open_capture
+from reflfield.errors import CaptureError
+
+FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
+LINEAR = ImageReading(encoding=parse_encoding("linear"))
+
+
+@pytest.fixture
+def frozen(tmp_path):
+    """A copy of the frozen capture of 2 cameras and 3 lights."""
+    return Path(shutil.copytree(FROZEN, tmp_path / "frozen"))
+
+
+def described(folder, edit):
+    path = folder / "capture.json"
+    document = json.loads(path.read_text())
+    edit(document)
+    path.write_text(json.dumps(document))
+
+
+def in_png(folder, codes_of, dtype=np.uint16):
+    """Replace all photographs by PNG files of their values (1 is the brightest) as codes."""
+
+    for path in sorted((folder / "photographs").glob("*.exr")):
+        image = read_image(path)
+        codes = codes_of(image / image.max()).round().astype(dtype)
+        cv2.imwrite(str(path.with_suffix(".png")), codes[..., ::-1])
+    pattern = "photographs/{camera}_{light}.png"
+    described(folder, lambda document: document.update(photographs={"pattern": pattern}))
+
+
+class TestCodes:
+    def test_linear_codes_of_12_bits_are_no_dark_srgb(self, frozen):
+        in_png(frozen, lambda image: 4095 * image)
+        with pytest.raises(
+            CaptureError, match=r"\.png: .*codes up to 4095 .*12 bits.*--encoding linear"
+        ):
+            open_capture(frozen)
+        capture = open_capture(frozen, reading=LINEAR)
+        assert capture.read_photograph(0).max() == np.float32(4095 / 65535)
+
+    def test_stated_as_srgb_they_are_read_so(self, frozen):
+        in_png(frozen, lambda image: 4095 * image)
+        described(frozen, lambda document: document.update(encoding="srgb"))
+        largest = open_capture(frozen).read_photograph(0).max()
+        encoded = 4095 / 65535
+        assert largest == pytest.approx(((encoded + 0.055) / 1.055) ** 2.4, rel=1e-6)
+
+    @pytest.mark.parametrize(
+        ("codes_of", "dtype"),
+        [
+            (lambda image: 16 * (4095 * image).round(), np.uint16),  # 12 bits at the top
+            (lambda image: 4200 * image, np.uint16),
+            (lambda image: 255 * image, np.uint8),
+        ],
+    )
+    def test_other_codes_pass(self, frozen, codes_of, dtype):
+        in_png(frozen, codes_of, dtype)
+        assert len(open_capture(frozen).photographs) > 0
+
+
+def same_file_twice(document):
+    document["photographs"] = [
+        {"camera": "v000", "light": light, "file": "photographs/v000_l000.exr"}
+        for light in ("l000", "l001")
+    ]
+
+
+class TestOneFileForTwoPhotographs:
+    def test_is_refused(self, frozen):
+        described(frozen, same_file_twice)
+        with pytest.raises(
+            CaptureError, match=r"v000_l000\.exr: .*same file for camera 'v000' under light"
+        ):
+            open_capture(frozen)
+
+    def test_frames_may_share_one(self, frozen):
+        described(frozen, same_file_twice)
+        assert open_capture(frozen, require_photographs=False).photographs
+
+
+class TestUnits:
+    @pytest.mark.parametrize(("factor", "n_notes"), [(1.0, 0), (1000.0, 1)])
+    def test_lights_in_millimetres_among_cameras_in_metres_are_noted(
+        self, frozen, factor, n_notes
+    ):
+        def move(document):
+            for light in document["lights"]:
+                if "position" in light:
+                    light["position"] = (factor * np.array(light["position"])).tolist()
+
+        described(frozen, move)
+        notes = [note for note in open_capture(frozen).notes if "one unit" in note]
+        assert len(notes) == n_notes
+        assert all("times as far" in note for note in notes)
