@@ -117,22 +117,16 @@ def smallest_distance(
     Points found below ``-cutoff`` are not followed further: their value is some number
     below ``-cutoff``.
     """
-    values = np.zeros(len(points))
-    for begin in range(0, len(points), _BLOCK_POINTS):
-        block = slice(begin, begin + _BLOCK_POINTS)
-        values[block] = _smallest_of_block(views, points[block], tolerance, cutoff)
-    return values
-
-
-def _smallest_of_block(
-    views: Sequence[View], points: Array, tolerance: int, cutoff: float
-) -> Array:
     lowest = np.full((tolerance + 1, len(points)), np.inf)
     alive = np.arange(len(points))
+    # One view after the other: their distances may be in files.
     for view in views:
-        _insert(lowest, alive, view.distance(points[alive]))
+        for begin in range(0, len(alive), _BLOCK_POINTS):
+            some = alive[begin : begin + _BLOCK_POINTS]
+            _insert(lowest, some, view.distance(points[some]))
         alive = alive[lowest[-1, alive] >= -cutoff]
-    return lowest[-1]
+    values: Array = lowest[-1]
+    return values
 
 
 def _insert(lowest: Array, columns: NDArray[np.intp], values: Array) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +44,11 @@ class View:
 
     def covered_pixels(self, most: int) -> Array:
         """Centres of at most so many pixels that the object covers, evenly spread, (n, 2)."""
-        row, col = np.nonzero(self.outline.values > 0.0)
-        some = np.unique(np.linspace(0, len(row) - 1, min(most, len(row))).astype(int))
-        return np.stack([col[some], row[some]], axis=1) + 0.5
+        covered = np.flatnonzero(self.outline.values > 0.0)
+        n_some = min(most, len(covered))
+        some = np.unique(np.linspace(0, len(covered) - 1, n_some).astype(int))
+        row, col = np.divmod(covered[some], self.camera.width)
+        return np.stack([col, row], axis=1) + 0.5
 
     @property
     def steepest(self) -> float:
@@ -57,15 +60,17 @@ class View:
 
 
 def measured_views(
-    cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]
+    cameras: Sequence[Camera],
+    silhouettes: Sequence[NDArray[np.floating]],
+    scratch: Path | None = None,
 ) -> list[View]:
-    """Check and measure the silhouettes."""
+    """Check and measure the silhouettes; with a folder, distances are kept in files there."""
     if len(cameras) != len(silhouettes) or not cameras:
         raise InputError(
             f"silhouettes: expected one for each of {len(cameras)} cameras (at least one), "
             f"received {len(silhouettes)}"
         )
-    views = []
+    views: list[View] = []
     pairs = zip(cameras, silhouettes, strict=True)
     for camera, silhouette in track(pairs, len(cameras), "silhouettes"):
         if np.shape(silhouette) != (camera.height, camera.width):
@@ -74,6 +79,8 @@ def measured_views(
                 f"{camera.width} columns as its camera says, received {np.shape(silhouette)}"
             )
         outline = signed_distance(silhouette, f"silhouette of view {camera.id!r}")
+        if scratch is not None:
+            outline = outline.moved_to(scratch / f"distances{len(views)}.npy")
         views.append(View(camera, outline))
     return views
 

@@ -8,7 +8,11 @@ hull agree far better then.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -217,7 +221,10 @@ def _inverse(pose: Array) -> Array:
 
 
 def explain_all(
-    cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]], before: float
+    cameras: Sequence[Camera],
+    silhouettes: Sequence[NDArray[np.floating]],
+    before: float,
+    scratch: Path | None = None,
 ) -> Explanation | None:
     """The mistake, common to all views, that makes them contradict each other.
 
@@ -227,13 +234,16 @@ def explain_all(
     silhouettes : sequence of (height, width) float
     before : float
         Median share of the silhouettes that the hull covers as they are.
+    scratch : Path, optional
+        Folder for files in which distances are kept instead of in memory.
 
     Returns
     -------
     Explanation or None
     """
-    inverted: list[NDArray[np.floating]] = [1.0 - np.asarray(s) for s in silhouettes]
-    tried = [("inverted", "all are inverted (white must mean object)", cameras, inverted)]
+    tried: list[tuple[str, str, Sequence[Camera], Sequence[NDArray[np.floating]]]]
+    inverted = "all are inverted (white must mean object)"
+    tried = [("inverted", inverted, cameras, Inverted(silhouettes))]
     conventions = [list(_pose_mistakes(camera)) for camera in cameras]
     for number, (kind, words, _) in enumerate(conventions[0]):
         moved = [
@@ -243,27 +253,46 @@ def explain_all(
         plural = words.replace("its camera axes", "the camera axes").replace(
             "its pose is camera-to-world", "the poses are camera-to-world"
         )
-        tried.append((kind, plural, moved, list(silhouettes)))
+        tried.append((kind, plural, moved, silhouettes))
     for kind, words, some_cameras, some_silhouettes in tried:
-        after = _agreement(some_cameras, some_silhouettes)
+        after = _agreement(some_cameras, some_silhouettes, scratch)
         if after >= 1.0 - CONTRADICTION and after >= before + 2.0 * CONTRADICTION:
             return Explanation(kind, words, before, after)
     return None
 
 
-def _agreement(cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]) -> float:
+@dataclass(frozen=True, eq=False)
+class Inverted(Sequence[NDArray[np.floating]]):
+    """Silhouettes with object and backdrop exchanged, each when it is asked for."""
+
+    silhouettes: Sequence[NDArray[np.floating]]
+
+    def __len__(self) -> int:
+        return len(self.silhouettes)
+
+    def __getitem__(self, view: Any) -> Any:
+        return 1.0 - np.asarray(self.silhouettes[view])
+
+
+def _agreement(
+    cameras: Sequence[Camera],
+    silhouettes: Sequence[NDArray[np.floating]],
+    scratch: Path | None,
+) -> float:
     """Median share of the silhouettes that the others leave room for; 0 without a hull.
 
     Views that the object leaves exclude little and agree with anything: with most of them
     nothing is explained.
     """
-    try:
-        views = measured_views(cameras, silhouettes)
-    except ReflfieldError:
-        return 0.0
-    if np.mean([view.outline.leaves_frame for view in views]) > 0.5:
-        return 0.0
-    verdict = examine(views)
+    own = nullcontext(None) if scratch is None else TemporaryDirectory(dir=scratch)
+    with own as folder:
+        try:
+            views = measured_views(cameras, silhouettes, Path(folder) if folder else None)
+        except ReflfieldError:
+            return 0.0
+        if np.mean([view.outline.leaves_frame for view in views]) > 0.5:
+            return 0.0
+        verdict = examine(views)
     return 0.0 if verdict is None else 1.0 - float(np.median(verdict.uncovered))
 
 

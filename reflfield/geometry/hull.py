@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -159,6 +160,8 @@ def visual_hull(
     cameras: Sequence[Camera],
     silhouettes: Sequence[NDArray[np.floating]],
     options: HullOptions | None = None,
+    *,
+    scratch: Path | None = None,
 ) -> tuple[Mesh, HullReport]:
     """Watertight mesh of the visual hull, smoothed and decimated.
 
@@ -171,6 +174,9 @@ def visual_hull(
     silhouettes : sequence of (height, width) float
         Coverage of the object in [0, 1], one for each camera.
     options : HullOptions, optional
+    scratch : Path, optional
+        Folder in which the distances of large silhouettes are kept, 4 bytes for each pixel,
+        instead of in memory. The hull is the same.
 
     Returns
     -------
@@ -193,10 +199,10 @@ def visual_hull(
     Time grows with the square of the resolution and linearly with the views.
     """
     options = options or HullOptions()
-    views = measured_views(cameras, silhouettes)
-    views, silhouettes, specks = without_specks(views, silhouettes)
+    views = measured_views(cameras, silhouettes, scratch)
+    views, silhouettes, specks = without_specks(views, silhouettes, scratch)
     with noting_small_parts(views):
-        outcome = _agreed_hull(views, silhouettes, options)
+        outcome = _agreed_hull(views, silhouettes, options, scratch)
     grid, mesh = outcome.carved.grid, outcome.carved.mesh
     agreement = outcome.fit or _agreement(mesh, cameras, silhouettes)
     report = HullReport(
@@ -245,7 +251,10 @@ def _carved(views: Sequence[View], options: HullOptions, tolerance: int) -> _Car
 
 
 def _agreed_hull(
-    views: Sequence[View], silhouettes: Sequence[NDArray[np.floating]], options: HullOptions
+    views: Sequence[View],
+    silhouettes: Sequence[NDArray[np.floating]],
+    options: HullOptions,
+    scratch: Path | None,
 ) -> _Outcome:
     """Hull of all views, or of those that agree, as `options.tolerance` says."""
     cameras = [view.camera for view in views]
@@ -263,7 +272,8 @@ def _agreed_hull(
         return _outcome_with_outliers(views, silhouettes, options, disagreement, usable)
     if carved is not None and disagreement.agree:
         return _Outcome(carved)
-    why = explain_all(cameras, silhouettes, disagreement.covered if carved else 0.0)
+    covered = disagreement.covered if carved else 0.0
+    why = explain_all(cameras, silhouettes, covered, scratch)
     if why is not None:
         raise GeometryError(
             "hull: expected silhouettes of one object, received contradicting ones: "

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -29,17 +31,30 @@ class SignedDistance:
 
     Parameters
     ----------
-    values : (height, width) float32
-        Pixels; positive inside the object.
+    stored : (height, width) float32, or Path
+        Pixels; positive inside the object; or the file (npy) that holds them.
     outline : (n, 2) float64
         Sub-pixel points of the outline, continuous pixel coordinates.
     rim : (k, 2) float64
         Points on the border of the image at pixels that the object covers.
     """
 
-    values: NDArray[np.float32]
+    stored: NDArray[np.float32] | Path
     outline: Array
     rim: Array
+
+    @property
+    def values(self) -> NDArray[np.float32]:
+        """Distances (height, width), pixels; of a file, no more in memory than is looked at."""
+        if isinstance(self.stored, Path):
+            distances: NDArray[np.float32] = np.load(self.stored, mmap_mode="r")
+            return distances
+        return self.stored
+
+    def moved_to(self, path: Path) -> SignedDistance:
+        """The same distances, kept in a file (npy) instead of in memory."""
+        np.save(path, self.values)
+        return replace(self, stored=path)
 
     @property
     def leaves_frame(self) -> bool:
@@ -55,12 +70,13 @@ class SignedDistance:
         Outside the frame the answer continues with slope 1: downwards (empty) if the
         object is in the frame as a whole, upwards (unknown, so nothing is carved) if not.
         """
-        height, width = self.values.shape
+        values = self.values
+        height, width = values.shape
         limit = np.array([width, height], dtype=np.float64)
         nearest = np.clip(pixels, 0.0, limit)
         beyond = np.hypot(*(pixels - nearest).T)
         inside = ndimage.map_coordinates(
-            self.values, (nearest - 0.5).T[::-1], order=1, mode="nearest", output=np.float64
+            values, (nearest - 0.5).T[::-1], order=1, mode="nearest", output=np.float64
         )
         if not self.leaves_frame:
             return inside - beyond
@@ -110,18 +126,18 @@ def signed_distance(
     coverage = _checked(silhouette, name)
     covered = coverage >= 0.5
     points, normals = _outline(coverage)
-    values: Array = _coarse_distance(covered)
+    values = _coarse_distance(covered)
     near = np.abs(values) <= _FINE_BAND
     row, col = np.nonzero(near)
     centres: Array = np.stack([col, row], axis=1).astype(np.float64) + 0.5
-    values[near] = np.where(covered, 1.0, -1.0)[near] * _distance_to_pieces(
+    values[near] = np.where(covered[near], 1.0, -1.0) * _distance_to_pieces(
         centres, points, normals
     )
-    return SignedDistance(values.astype(np.float32), points, _rim_points(covered))
+    return SignedDistance(values, points, _rim_points(covered))
 
 
-def _checked(silhouette: NDArray[np.floating], name: str) -> Array:
-    coverage = np.asarray(silhouette, dtype=np.float64)
+def _checked(silhouette: NDArray[np.floating], name: str) -> NDArray[np.floating]:
+    coverage = np.asarray(silhouette)
     check_shape(name, coverage, (None, None))
     if not ((coverage >= 0.0) & (coverage <= 1.0)).all():
         raise InputError(
@@ -138,11 +154,14 @@ def _checked(silhouette: NDArray[np.floating], name: str) -> Array:
     return coverage
 
 
-def _coarse_distance(covered: NDArray[np.bool_]) -> Array:
+def _coarse_distance(covered: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance of pixel centres to the boundary between pixels, about half a pixel."""
-    inner = ndimage.distance_transform_edt(covered)
-    outer = ndimage.distance_transform_edt(~covered)
-    return np.where(covered, inner - 0.5, 0.5 - outer).astype(np.float64)
+    inner, outer = (
+        cv2.distanceTransform(part.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        for part in (np.ascontiguousarray(covered), np.ascontiguousarray(~covered))
+    )
+    half = np.float32(0.5)
+    return np.where(covered, inner - half, half - outer)
 
 
 def _rim_points(covered: NDArray[np.bool_]) -> Array:
@@ -159,32 +178,38 @@ def _rim_points(covered: NDArray[np.bool_]) -> Array:
     )
 
 
-def _outline(coverage: Array) -> tuple[Array, Array]:
+def _outline(coverage: NDArray[np.floating]) -> tuple[Array, Array]:
     """Points of the outline and unit normals into the object, both (n, 2) as (x, y)."""
-    # Derivative of a 3 x 3 neighbourhood; the pixel's own box filter is too narrow.
-    slope_y = ndimage.sobel(coverage, axis=0, mode="nearest")
-    slope_x = ndimage.sobel(coverage, axis=1, mode="nearest")
-    along_x = _crossings(coverage, slope_x, slope_y)
-    along_y = _crossings(coverage.T, slope_y.T, slope_x.T)
+    along_x, along_y = _crossings(coverage), _crossings(coverage.T)
     points = np.concatenate([along_x[0], along_y[0][:, ::-1]])
     normals = np.concatenate([along_x[1], along_y[1][:, ::-1]])
     return points, normals
 
 
-def _crossings(coverage: Array, slope: Array, slope_across: Array) -> tuple[Array, Array]:
+def _slopes(
+    coverage: NDArray[np.floating], row: NDArray[np.intp], col: NDArray[np.intp]
+) -> tuple[Array, Array]:
+    """Sobel's derivatives along and across the rows at some pixels, (n,).
+
+    Derivative of a 3 x 3 neighbourhood; the pixel's own box filter is too narrow.
+    """
+    rows = [np.clip(row + step, 0, coverage.shape[0] - 1) for step in (-1, 0, 1)]
+    cols = [np.clip(col + step, 0, coverage.shape[1] - 1) for step in (-1, 0, 1)]
+    beside = np.array([[coverage[r, c] for c in cols] for r in rows], dtype=np.float64)
+    along, across = beside[:, 2] - beside[:, 0], beside[2] - beside[0]
+    return 2.0 * along[1] + (along[0] + along[2]), 2.0 * across[1] + (across[0] + across[2])
+
+
+def _crossings(coverage: NDArray[np.floating]) -> tuple[Array, Array]:
     """Crossings of the level one half between horizontal neighbours.
 
     Where the outline is nearer to horizontal, the vertical neighbours measure it better
     and are left to do so.
     """
-    row, col = np.nonzero((coverage[:, :-1] >= 0.5) != (coverage[:, 1:] >= 0.5))
-    normal = np.stack(
-        [
-            slope[row, col] + slope[row, col + 1],
-            slope_across[row, col] + slope_across[row, col + 1],
-        ],
-        axis=1,
-    )
+    covered = coverage >= 0.5
+    row, col = np.nonzero(covered[:, :-1] != covered[:, 1:])
+    left, right = _slopes(coverage, row, col), _slopes(coverage, row, col + 1)
+    normal: Array = np.stack([left[0] + right[0], left[1] + right[1]], axis=1)
     length = np.hypot(*normal.T)
     # Where slopes cancel (a line one pixel wide) the two pixels still tell the direction.
     flat = length < 1e-6
@@ -199,12 +224,14 @@ def _crossings(coverage: Array, slope: Array, slope_across: Array) -> tuple[Arra
     return np.stack([x, row + 0.5], axis=1), normal
 
 
-def _edge_position(coverage: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Array:
+def _edge_position(
+    coverage: NDArray[np.floating], row: NDArray[np.intp], col: NDArray[np.intp]
+) -> Array:
     """Position of the outline between pixel centres `col` and `col + 1`."""
     last = coverage.shape[1] - 1
-    window = np.stack(
+    window: Array = np.stack(
         [coverage[row, np.clip(col + step, 0, last)] for step in (-1, 0, 1, 2)], axis=1
-    )
+    ).astype(np.float64)
     falling = window[:, 1] > window[:, 2]
     ordered = np.where(falling[:, None], window, window[:, ::-1])
     full_to_empty = (ordered[:, 0] > 0.99) & (ordered[:, 3] < 0.01)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,9 +25,37 @@ Array = NDArray[np.float64]
 SMALL_PART = 0.01
 
 
+@dataclass(frozen=True, eq=False)
+class Cleaned(Sequence[NDArray[np.floating]]):
+    """Silhouettes without some of their pixels, each when it is asked for.
+
+    Parameters
+    ----------
+    silhouettes : sequence of (height, width) float
+    removed : dict of int to (n,) int
+        Pixels, row by row, that become empty, by the number of the silhouette.
+    """
+
+    silhouettes: Sequence[NDArray[np.floating]]
+    removed: dict[int, NDArray[np.intp]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.silhouettes)
+
+    def __getitem__(self, view: Any) -> Any:
+        silhouette = self.silhouettes[view]
+        if view not in self.removed:
+            return silhouette
+        clean = np.array(silhouette)
+        clean.ravel()[self.removed[view]] = 0.0
+        return clean
+
+
 def without_specks(
-    views: Sequence[View], silhouettes: Sequence[NDArray[np.floating]]
-) -> tuple[list[View], list[NDArray[np.floating]], dict[str, int]]:
+    views: Sequence[View],
+    silhouettes: Sequence[NDArray[np.floating]],
+    scratch: Path | None = None,
+) -> tuple[list[View], Sequence[NDArray[np.floating]], dict[str, int]]:
     """Views without the small parts of silhouettes that all other views exclude.
 
     A part is removed if its area is below `SMALL_PART` of the largest part's and if some
@@ -37,11 +67,13 @@ def without_specks(
     views : sequence of View
     silhouettes : sequence of (height, width) float
         Coverage, one for each view.
+    scratch : Path, optional
+        Folder for files in which distances are kept instead of in memory.
 
     Returns
     -------
     views : list of View
-    silhouettes : list of (height, width) float
+    silhouettes : sequence of (height, width) float
     removed : dict of str to int
         Number of parts removed, by the names of the cameras; without views that lost none.
 
@@ -50,37 +82,41 @@ def without_specks(
     Where no silhouette has small parts, nothing is computed.
     """
     small = [_small_parts(view) for view in views]
-    if not any(count for count, _ in small):
-        return list(views), list(silhouettes), {}
+    if not any(parts.count for parts in small):
+        return list(views), silhouettes, {}
     inner = [
-        _without_rim(view, labels) if count else view
-        for view, (count, labels) in zip(views, small, strict=True)
+        _without_rim(view, parts) if parts.count else view
+        for view, parts in zip(views, small, strict=True)
     ]
     box = robust_bounds(inner)
     if box is None:
-        return list(views), list(silhouettes), {}
+        return list(views), silhouettes, {}
     votes = votes_of(inner, *box)
-    kept_views, kept_silhouettes, removed = list(views), list(silhouettes), dict[str, int]()
-    for number, (count, labels) in enumerate(small):
-        if not count:
+    kept_views, clean, removed = list(views), Cleaned(silhouettes), dict[str, int]()
+    for number, parts in enumerate(small):
+        if not parts.count:
             continue
         others = [i for i in range(len(views)) if i != number]
         score = best_score(votes, votes.of(others))
-        row, col = np.nonzero(labels)
+        row, col = np.divmod(parts.pixels, views[number].camera.width)
         pixels: Array = np.stack([col, row], axis=1).astype(np.float64) + 0.5
         best = best_on_rays(views[number], pixels, votes, score)
         supported = (best >= 0) & (score[best] < 0.5)
-        lost = np.ones(labels.max() + 1, dtype=bool)
-        lost[np.unique(labels[row, col][supported])] = False
+        lost = np.ones(parts.count + 1, dtype=bool)
+        lost[np.unique(parts.number[supported])] = False
         lost[0] = False
         if lost.any():
             name = views[number].camera.id
             removed[name] = int(lost.sum())
-            clean = np.where(_with_fringe(lost[labels]), 0.0, silhouettes[number])
-            kept_silhouettes[number] = clean
-            outline = signed_distance(clean, f"silhouette of view {name!r}")
+            camera = views[number].camera
+            gone = np.zeros((camera.height, camera.width), dtype=bool)
+            gone.ravel()[parts.pixels[lost[parts.number]]] = True
+            clean.removed[number] = np.flatnonzero(_with_fringe(gone))
+            outline = signed_distance(clean[number], f"silhouette of view {name!r}")
+            if scratch is not None:
+                outline = outline.moved_to(scratch / f"distances{number}.npy")
             kept_views[number] = replace(views[number], outline=outline)
-    return kept_views, kept_silhouettes, removed
+    return kept_views, clean, removed
 
 
 def specks_words(removed: Mapping[str, int]) -> tuple[str, ...]:
@@ -111,7 +147,7 @@ def noting_small_parts(views: Sequence[View]) -> Iterator[None]:
     try:
         yield
     except GeometryError as error:
-        counts = {view.camera.id: _small_parts(view)[0] for view in views}
+        counts = {view.camera.id: _small_parts(view).count for view in views}
         shown = [f"{name} {count}" for name, count in counts.items() if count]
         if shown:
             error.add_note(
@@ -121,23 +157,34 @@ def noting_small_parts(views: Sequence[View]) -> Iterator[None]:
         raise
 
 
-def _small_parts(view: View) -> tuple[int, NDArray[np.int32]]:
-    """Number of small parts, and an image of their numbers from 1; 0 elsewhere."""
-    covered = (view.outline.values > 0.0).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(covered, connectivity=8)
+@dataclass(frozen=True, eq=False)
+class _SmallParts:
+    """Small parts of one silhouette: how many, their pixels, their numbers from 1."""
+
+    count: int
+    pixels: NDArray[np.intp]
+    number: NDArray[np.int64]
+
+
+def _small_parts(view: View) -> _SmallParts:
+    covered = (view.outline.values > 0.0).view(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(covered, connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
     small = area < SMALL_PART * area[1:].max(initial=0)
     small[0] = False
-    numbers = np.cumsum(small).astype(np.int32) * small
-    return int(small.sum()), numbers[labels] if count > 1 else labels
+    if not small.any():
+        return _SmallParts(0, np.zeros(0, np.intp), np.zeros(0, np.int64))
+    pixels = np.flatnonzero(small[labels])
+    numbers = np.cumsum(small)
+    return _SmallParts(int(small.sum()), pixels, numbers[labels.ravel()[pixels]])
 
 
-def _without_rim(view: View, labels: NDArray[np.int32]) -> View:
+def _without_rim(view: View, parts: _SmallParts) -> View:
     """View whose small parts do not make it one that the object leaves."""
-    height, width = labels.shape
+    height, width = view.camera.height, view.camera.width
     col = np.clip(np.floor(view.outline.rim[:, 0]).astype(int), 0, width - 1)
     row = np.clip(np.floor(view.outline.rim[:, 1]).astype(int), 0, height - 1)
-    rim = view.outline.rim[labels[row, col] == 0]
+    rim = view.outline.rim[~np.isin(row * width + col, parts.pixels)]
     return replace(view, outline=replace(view.outline, rim=rim))
 
 

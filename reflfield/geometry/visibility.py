@@ -82,7 +82,7 @@ def view_visibility(
     camera: Camera,
     options: VisibilityOptions | None = None,
     edges: Bools | None = None,
-    silhouette: NDArray[np.floating] | None = None,
+    silhouette: NDArray[np.floating] | Bools | None = None,
 ) -> Bools:
     """Which texels a camera sees well enough to sample its photograph.
 
@@ -100,7 +100,7 @@ def view_visibility(
     options : VisibilityOptions, optional
     edges : (height, width) bool, optional
         Result of `depth_edges` for this camera, to share it between blocks of texels.
-    silhouette : (height, width) float, optional
+    silhouette : (height, width) float or bool, optional
         Coverage of the object in [0, 1]; texels on pixels below `coverage` are not seen.
         Of use where the base geometry is larger than the object, as an image plane is.
 

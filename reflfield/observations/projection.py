@@ -336,18 +336,20 @@ def _samples_at(
 ) -> tuple[Floats, Kinds]:
     """Samples of one view at the pixels of points, and of what kind each value is."""
     indices = capture.photograph_index[view, lights]
-    images, kinds = [], np.zeros((len(points), len(lights), 3), np.uint8)
+    camera = capture.cameras[view]
+    images = np.zeros((len(lights), camera.height, camera.width, 3), np.float32)
+    kinds = np.zeros((len(points), len(lights), 3), np.uint8)
     for j, index in enumerate(indices):
         image, measured = capture.read_measured(int(index))
         if not measured.all():
             of_pixels = pixel_kinds(image, measured)
             image = with_bounded_black(image, of_pixels)
             _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
-        images.append(image)
+        images[j] = image
     irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
     # A light may have no blue, a spot may miss a texel: nothing is learned there.
     lit = irradiance > 0
-    values = sample_bilinear(np.stack(images), pixels)
+    values = sample_bilinear(images, pixels)
     values /= np.where(lit, irradiance, np.float32(1.0))
     kinds[~lit] = VALUE_KINDS.index("dark")
     unlit = ~lit.any(axis=2)
@@ -384,7 +386,9 @@ def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
     array([0.105, 0.021, 0.211], dtype=float32)
     """
     black = kinds == VALUE_KINDS.index("black")
-    positive = np.where(image > 0, image, np.inf).min(axis=(0, 1))
+    if not black.any():
+        return image
+    positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)
     darkest = np.where(np.isfinite(positive), positive, 0.0)
     return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
 

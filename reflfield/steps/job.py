@@ -27,6 +27,7 @@ from reflfield.stages import RESTARTABLE, StageFolder, key_of
 from reflfield.steps.clipping import MEASURED, stored_measured
 from reflfield.steps.holding_out import Split, split_of
 from reflfield.steps.options import PipelineOptions
+from reflfield.steps.stored_silhouettes import SILHOUETTES, StoredSilhouettes
 
 # What an option says that is decided by comparison.
 AUTO = "auto"
@@ -131,13 +132,11 @@ class Job:
         """Whether the base surface is the image plane of one view."""
         return self.capture.base_geometry == PLANE
 
-    @cached_property
-    def view_silhouettes(self) -> list[NDArray[np.float32]]:
-        """Coverage of every training view."""
-        stored = self.result("silhouettes", "silhouettes.npz")
-        return [
-            stored[f"view{i}"].astype(np.float32) / np.float32(255) for i in range(len(stored))
-        ]
+    @property
+    def view_silhouettes(self) -> StoredSilhouettes:
+        """Coverage of every training view, each read when it is asked for."""
+        path = self.stages.root / "silhouettes" / SILHOUETTES
+        return StoredSilhouettes(path, self.training.cameras)
 
     @cached_property
     def hull_mesh(self) -> Mesh:

@@ -16,8 +16,13 @@ from reflfield.steps.job import Job
 
 # Libraries, compiled kernels and the code itself, measured.
 BASE_BYTES = 512 << 20
-# A photograph while it is read: as stored, as float32, the copy that is sampled.
-PHOTOGRAPH_COPIES = 3
+# A pixel of a photograph while it is read: as stored, as float32, what of it was measured, and
+# the copy that is sampled or shown.
+PHOTOGRAPH_BYTES = 48
+# A pixel of a silhouette while it is made from photographs.
+SILHOUETTE_BYTES = 80
+# A pixel of the signed distance to an outline.
+DISTANCE_BYTES = 4
 # Position, frames, area, quaternions: what is kept of a texel besides the arrays below.
 TEXEL_BYTES = 256
 # Columns of a block while they are inferred: resampled, by rows, clean, residual, weighted.
@@ -31,18 +36,34 @@ LARGEST_USE = 0.8
 def least_memory(job: Job) -> int:
     """Bytes that the run holds at the same time however small its blocks are.
 
-    Silhouettes of all views and one photograph, or what is kept of every texel with the
-    samples of one view under all lights, whichever is more; and one block of each thread, or
-    the columns of one, whichever is more.
+    Of every view which of its pixels are covered, with what is made of the largest image; or
+    what is kept of every texel with the samples of one view under all lights, whichever is
+    more; and one block of each thread, or the columns of one, whichever is more.
     """
     training = job.training
     pixels = [camera.width * camera.height for camera in training.cameras]
-    views = 5 * sum(pixels) + 12 * PHOTOGRAPH_COPIES * max(pixels)
+    held = [camera.width * camera.height for camera in job.held_frames.cameras]
+    made = any(path is None for path in training.silhouettes)
+    largest = max(max(PHOTOGRAPH_BYTES, SILHOUETTE_BYTES * made) * max(pixels),
+                  COMPARED_BYTES * max(held, default=0))  # fmt: skip
+    views = sum(pixels) // 8 + largest
     rank = max(job.options.completion.rank, job.options.compression.rank)
     each = TEXEL_BYTES + training.n_views + 7 * training.n_lights + 12 * rank
     blocks = job.resources.workers * job.resources.block_bytes
     columns = columns_bytes(job.sides[0] ** 2 * job.sides[1] ** 2)
     return BASE_BYTES + max(views, most_texels(job) * each) + max(blocks, columns)
+
+
+def keeps_distances(job: Job) -> bool:
+    """Whether the distances to the outlines of all views may stay in memory."""
+    pixels = sum(camera.width * camera.height for camera in job.training.cameras)
+    return DISTANCE_BYTES * pixels <= job.resources.max_memory // 8
+
+
+def silhouettes_at_once(job: Job) -> int:
+    """Threads that may each make a silhouette at a time."""
+    most = max(camera.width * camera.height for camera in job.training.cameras)
+    return int(max(1, (job.resources.max_memory - BASE_BYTES) // (SILHOUETTE_BYTES * most)))
 
 
 def most_texels(job: Job) -> int:
@@ -86,9 +107,11 @@ def writers_at_once(job: Job) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
     n_texels, n_views, n_lights = (len(job.texels), job.training.n_views, job.training.n_lights)
     views = chunk_shape(n_texels, n_views, n_lights)[1]
-    each = views * n_texels * n_lights * SAMPLE_BYTES + job.resources.block_bytes
+    samples = views * n_texels * n_lights * SAMPLE_BYTES
+    pixels = max(camera.width * camera.height for camera in job.training.cameras)
+    photographs = max(WRITER_COPIES * job.resources.block_bytes, PHOTOGRAPH_BYTES * pixels)
     free = job.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES
-    return int(max(1, free // (WRITER_COPIES * each)))
+    return int(max(1, free // (WRITER_COPIES * samples + photographs)))
 
 
 # --- pictures outside of a run -------------------------------------------------------------

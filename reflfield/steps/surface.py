@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from reflfield.capture.model import Capture
 from reflfield.cluster import threads_here
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.atlas import Atlas, built_atlas, fallback_words
-from reflfield.geometry.hull import visual_hull
+from reflfield.geometry.hull import HullReport, visual_hull
 from reflfield.geometry.mesh import Mesh, write_ply
 from reflfield.geometry.plane import image_plane
 from reflfield.geometry.ray_scene import RayScene
@@ -28,7 +29,9 @@ from reflfield.geometry.visibility import (
 )
 from reflfield.stages import WARNINGS, plain
 from reflfield.steps.job import Job
+from reflfield.steps.memory import keeps_distances, silhouettes_at_once
 from reflfield.steps.options import SMALLEST_TEXTURE
+from reflfield.steps.stored_silhouettes import SILHOUETTES, store_silhouettes
 
 # Among the counts of the hull: names of the views that it is made without.
 LEFT_OUT = "views left out"
@@ -36,18 +39,22 @@ LEFT_OUT = "views left out"
 METHOD = "charts made by"
 # Views, or lights, of one block.
 DIRECTIONS_AT_ONCE = 8
+# Pixels of the silhouettes of one block.
+PIXELS_AT_ONCE = 16 << 20
 
 
 def write_silhouettes(job: Job, folder: Path) -> dict[str, Any]:
     """Coverage of every training view, read or made, as 8-bit arrays."""
     capture = job.training
     found = job.blocks(folder).map(
-        "silhouettes", silhouettes_block, capture, runs(capture.n_views)
+        "silhouettes",
+        silhouettes_block,
+        capture,
+        silhouette_runs(capture),
+        at_once=silhouettes_at_once(job),
     )
-    views: dict[str, Any] = {
-        name: coverage for arrays in found for name, coverage in arrays.items()
-    }
-    np.savez_compressed(folder / "silhouettes.npz", **views)
+    views = (named for arrays in found for named in arrays.items())
+    store_silhouettes(folder / SILHOUETTES, views)
     given = sum(path is not None for path in capture.silhouettes)
     return {"views": capture.n_views, "silhouettes given": given}
 
@@ -57,6 +64,14 @@ def silhouettes_block(capture: Capture, views: range) -> dict[str, Any]:
     return {
         f"view{i}": np.rint(capture.read_silhouette(i) * 255).astype(np.uint8) for i in views
     }
+
+
+def silhouette_runs(capture: Capture) -> list[range]:
+    """Views whose silhouettes are made together: of large images, few."""
+    pixels = max(camera.width * camera.height for camera in capture.cameras)
+    step = int(np.clip(PIXELS_AT_ONCE // pixels, 1, DIRECTIONS_AT_ONCE))
+    n = capture.n_views
+    return [range(i, min(i + step, n)) for i in range(0, n, step)]
 
 
 def runs(n: int) -> list[range]:
@@ -77,7 +92,7 @@ def write_hull(job: Job, folder: Path) -> dict[str, Any]:
     if job.is_plane:
         mesh = image_plane(job.training.cameras[0], job.view_silhouettes[0]).mesh
     else:
-        mesh, made = visual_hull(job.training.cameras, job.view_silhouettes, job.options.hull)
+        mesh, made = _carved(job, folder)
         details = {k: _listed(v) for k, v in asdict(made).items()}
         counts = {
             "views that contradict the others": [c.view for c in made.contradictions],
@@ -91,6 +106,15 @@ def write_hull(job: Job, folder: Path) -> dict[str, Any]:
     write_ply(folder / "hull.ply", mesh)
     (folder / "hull.json").write_text(json.dumps(plain(details)))
     return {"triangles": len(mesh.faces), "watertight": mesh.watertight, **counts}
+
+
+def _carved(job: Job, folder: Path) -> tuple[Mesh, HullReport]:
+    """Visual hull; what does not fit into memory is kept in the folder meanwhile."""
+    cameras, options = job.training.cameras, job.options.hull
+    if keeps_distances(job):
+        return visual_hull(cameras, job.view_silhouettes, options)
+    with TemporaryDirectory(dir=folder) as scratch:
+        return visual_hull(cameras, job.view_silhouettes, options, scratch=Path(scratch))
 
 
 def _listed(value: Any) -> Any:
@@ -166,8 +190,8 @@ class Sight:
     texels : TexelTable
     mesh : Mesh
     options : VisibilityOptions
-    silhouettes : sequence of (h, w) float32 or None
-        Of the views.
+    covered : sequence of (n,) uint8 or None
+        Pixels of the views that the object covers, row by row, eight in a byte.
     threads : int
         For rays; a cluster's worker uses its own number.
     """
@@ -176,8 +200,16 @@ class Sight:
     texels: TexelTable
     mesh: Mesh
     options: VisibilityOptions
-    silhouettes: Sequence[NDArray[np.float32] | None]
+    covered: Sequence[NDArray[np.uint8] | None]
     threads: int
+
+    def silhouette(self, view: int) -> NDArray[np.bool_] | None:
+        """Pixels (h, w) of a view that the object covers."""
+        bits, camera = self.covered[view], self.capture.cameras[view]
+        if bits is None:
+            return None
+        pixels = np.unpackbits(bits, count=camera.width * camera.height)
+        return pixels.reshape(camera.height, camera.width).astype(np.bool_)
 
 
 def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
@@ -188,13 +220,19 @@ def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
     if kind == "views":
         columns = [
             view_visibility(
-                texels, scene, capture.cameras[i], options, silhouette=context.silhouettes[i]
+                texels, scene, capture.cameras[i], options, silhouette=context.silhouette(i)
             )
             for i in some
         ]
     else:
         columns = [light_visibility(texels, scene, capture.lights[i], options) for i in some]
     return {"seen": np.stack(columns, axis=1)}
+
+
+def covered_pixels(job: Job) -> list[NDArray[np.uint8]]:
+    """Pixels of each view that count as covered by the object, eight in a byte."""
+    least = job.options.visibility.coverage
+    return [np.packbits(silhouette >= least) for silhouette in job.view_silhouettes]
 
 
 def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
@@ -205,7 +243,7 @@ def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
         texels,
         job.surface_atlas.mesh,
         job.options.visibility,
-        [None] * capture.n_views if job.is_plane else job.view_silhouettes,
+        [None] * capture.n_views if job.is_plane else covered_pixels(job),
         job.resources.workers,
     )
     view_runs, light_runs = runs(capture.n_views), runs(capture.n_lights)
