@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,8 +77,12 @@ def agrees(path: Path, recorded: Mapping[str, Any]) -> bool:
     False
     """
     try:
-        return path.stat().st_size == recorded["bytes"] and crc32c(path) == recorded["crc32c"]
-    except FileNotFoundError:
+        status = path.stat()
+        same = stat.S_ISREG(status.st_mode) and status.st_size == recorded["bytes"]
+        return same and crc32c(path) == recorded["crc32c"]
+    except PermissionError:
+        raise
+    except OSError:  # gone, or a folder, or links in a circle
         return False
 
 

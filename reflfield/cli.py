@@ -307,7 +307,7 @@ def relight(
     refuse_without("--orbit; frames bring their own cameras and lights", orbit, of_orbit)
     refuse_without("--environment MAP", environment, of_map)
     limits = picture_limits(samples, workers, max_memory)
-    opened = open_field(field)
+    opened = open_field(field, max_bytes=limits[1].max_memory)
     with showing_progress():
         if frames is not None:
             reading = {"format": format, "follow_links": follow_links}
@@ -369,7 +369,8 @@ def compare(
     from reflfield.steps.standalone import write_standalone_comparison
 
     limits = picture_limits(samples, workers, max_memory)
-    opened, reading = open_field(field), image_reading(encoding, layer)
+    opened = open_field(field, max_bytes=limits[1].max_memory)
+    reading = image_reading(encoding, layer)
     with showing_progress():
         photographed = open_capture(frames, format, follow_links=follow_links, reading=reading)
         options = check_frames_memory(opened, photographed, *limits, compared=True)
@@ -382,17 +383,21 @@ def compare(
 @app.command()
 def inspect(
     path: Annotated[Path, typer.Argument(help="A capture or a field.rfld.")],
+    max_memory: MaxMemory = "4GB",
     format: Format = None,
     follow_links: FollowLinks = False,
     encoding: EncodingOption = None,
     layer: LayerOption = None,
 ) -> None:
     """Say what a capture or a field holds."""
+    from reflfield.config import parse_bytes
+
+    most_bytes = parse_bytes(max_memory)
     if path.suffix.lower() == ".rfld":
         from reflfield.field.file import describe as describe_field
         from reflfield.field.file import open_field
 
-        lines = describe_field(open_field(path)).lines()
+        lines = describe_field(open_field(path, max_bytes=most_bytes)).lines()
     else:
         from reflfield.capture.inspect import describe
         from reflfield.capture.readers import open_capture

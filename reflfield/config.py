@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import re
+import sys
 import tomllib
 import types
 from collections.abc import Iterable, Mapping
@@ -18,10 +18,16 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import tomli_w
 
 from reflfield.errors import InputError
+from reflfield.files import read_bytes
 
 Options = TypeVar("Options")
 # A configuration file is written by hand: anything larger is another file.
 LARGEST_FILE = 1 << 20
+# Whole numbers that fit 63 bits, and what else is said of values in messages.
+LARGEST_WHOLE = (1 << 63) - 1
+LONGEST_SHOWN = 100
+# Of an option's name: stage, group, option.
+MOST_PARTS = 8
 # Libraries and code take 0.4 GB before the first photograph is read.
 LEAST_MEMORY = 1 << 30
 # Threads beyond any machine's cores: a number above is a slip.
@@ -34,15 +40,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If the file cannot be read or is not TOML; the message names it.
+        If the file cannot be read, is no regular one, or is not TOML; the message names it.
     """
+    content = read_bytes(path, LARGEST_FILE)
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path}: expected options in TOML, received more than 1 MB")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return tomllib.loads(content.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # ValueError also of numbers without end
         raise InputError(f"{path}: expected TOML, received something else: {error}") from error
 
 
@@ -71,7 +74,11 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         name, equals, text = setting.partition("=")
         path = [part.strip() for part in name.split(".")]
         if not (equals and all(path)):
-            raise InputError(f"--set: expected stage.option=value, received {setting!r}")
+            raise InputError(f"--set: expected stage.option=value, received {_shown(setting)}")
+        if len(path) > MOST_PARTS:
+            raise InputError(
+                f"--set: expected stage.option=value, received a name of {len(path)} parts"
+            )
         table: Any = _toml_value(text.strip())
         for part in reversed(path):
             table = {part: table}
@@ -82,7 +89,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 def _toml_value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):  # ValueError also of numbers without end
         return text
 
 
@@ -134,7 +141,9 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
         current = getattr(options, name)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
-                raise InputError(f"option {label!r}: expected a table, received {value!r}")
+                raise InputError(
+                    f"option {label!r}: expected a table, received {_shown(value)}"
+                )
             changes[name] = with_tables(current, value, f"{label}.")
         else:
             changes[name] = _converted(label, value, hints[name])
@@ -147,7 +156,7 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
 def _unknown(label: str, name: str, known: list[str]) -> str:
     near = get_close_matches(name, known, n=1)
     remedy = f"; did you mean {near[0]!r}?" if near else ""
-    return f"option {label!r}: unknown; expected one of {', '.join(known)}{remedy}"
+    return f"option {_shown(label)}: unknown; expected one of {', '.join(known)}{remedy}"
 
 
 def _converted(label: str, value: Any, expected: Any) -> Any:
@@ -160,13 +169,31 @@ def _converted(label: str, value: Any, expected: Any) -> Any:
     if origin is Literal:
         fits = value in get_args(expected)
     elif expected is float and _is_number(value):
-        value, fits = float(value), math.isfinite(value)
+        fits = abs(value) <= sys.float_info.max  # nor is NaN
+        value = float(value) if fits else value
     else:
         # True is an int to Python, and not to those who write options.
         fits = isinstance(value, expected) and isinstance(value, bool) == (expected is bool)
+        fits = fits and not (expected is int and abs(value) > LARGEST_WHOLE)
     if not fits:
-        raise InputError(f"option {label!r}: expected {_words(expected)}, received {value!r}")
+        raise _another_value(label, value, expected)
     return value
+
+
+def _another_value(label: str, value: Any, expected: Any) -> InputError:
+    received = _shown(value)
+    return InputError(f"option {label!r}: expected {_words(expected)}, received {received}")
+
+
+def _shown(value: Any) -> str:
+    """A value for messages, which a file may have made of any size."""
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        return f"one of {value.bit_length()} bits"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # thousands of digits or of levels
+        return f"a {type(value).__name__} of numbers or levels without end"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} ..."
 
 
 def _is_number(value: Any) -> bool:
@@ -179,7 +206,7 @@ def _converted_tuple(label: str, value: Any, expected: Any) -> tuple[Any, ...]:
     if given and len(kinds) == 2 and kinds[1] is Ellipsis:
         kinds = kinds[:1] * len(value)
     if not given or len(value) != len(kinds):
-        raise InputError(f"option {label!r}: expected {_words(expected)}, received {value!r}")
+        raise _another_value(label, value, expected)
     return tuple(_converted(label, v, kind) for v, kind in zip(value, kinds, strict=True))
 
 
@@ -194,7 +221,7 @@ def _first_that_fits(label: str, value: Any, expected: Any) -> Any:
             return _converted(label, value, choice)
         except InputError:
             continue
-    raise InputError(f"option {label!r}: expected {_words(expected)}, received {value!r}")
+    raise _another_value(label, value, expected)
 
 
 def _words(expected: Any) -> str:
@@ -294,7 +321,7 @@ def parse_bytes(text: str, option: str = "--max-memory") -> int:
         return int(float(digits) * _UNITS[upper[len(digits) :]])
     except (ValueError, KeyError, OverflowError):
         raise InputError(
-            f"{option}: expected a number with MB or GB, such as 4GB, received {text!r}"
+            f"{option}: expected a number with MB or GB, such as 4GB, received {_shown(text)}"
         ) from None
 
 
@@ -377,7 +404,7 @@ def parse_hold_out(text: str) -> HoldOut:
         if count < 0 or name in counts:
             raise InputError(
                 "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
-                f"{text!r}"
+                f"{_shown(text)}"
             )
         counts[name] = count
     test = counts.pop("test", 0) > 0

@@ -15,11 +15,13 @@ from typing import Any
 
 from reflfield.checksums import is_stamped, stamped
 from reflfield.errors import InputError
-from reflfield.files import check_regular, replacing
+from reflfield.files import check_regular, read_bytes, replacing
 
 # A file that was changed so shortly before it was hashed may change again within the same tick
 # of the file system's clock; it is hashed again by the next run.
 TICK_NS = 2_000_000_000
+# An index of more files than any capture has.
+LARGEST_INDEX = 256 << 20
 
 
 def file_digest(path: Path, error: type[InputError] = InputError) -> bytes:
@@ -113,8 +115,8 @@ def _state(path: Path) -> list[int]:
 
 def _read_index(index: Path) -> dict[str, Any]:
     try:
-        document = json.loads(index.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        document = json.loads(read_bytes(index, LARGEST_INDEX))
+    except (InputError, ValueError, RecursionError):
         return {}
     if not isinstance(document, dict) or not is_stamped(document):
         return {}

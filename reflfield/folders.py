@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from reflfield.errors import InputError
 from reflfield.files import flush_to_disk
@@ -74,6 +75,15 @@ def folder_bytes(folder: Path, without: str) -> int:
     return sum(path.stat().st_size for path in files)
 
 
+def _opened_lock(path: Path) -> IO[bytes]:
+    """A file to be locked, which is created and never written; no link, no pipe waited for."""
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise InputError(
+            f"{path}: expected the lock of a run, received something else; remove it"
+        )
+    return path.open("ab")
+
+
 @contextmanager
 def only_run(root: Path) -> Iterator[None]:
     """Keep other runs out of a folder while the block runs.
@@ -86,7 +96,7 @@ def only_run(root: Path) -> Iterator[None]:
         If another run holds it.
     """
     root.mkdir(parents=True, exist_ok=True)
-    with (root / LOCK).open("w") as lock:
+    with _opened_lock(root / LOCK) as lock:
         if fcntl is not None:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import platform
 import shutil
 import threading
@@ -34,7 +35,7 @@ import psutil
 
 from reflfield.checksums import checksums, first_damaged, is_stamped, stamped
 from reflfield.errors import InputError
-from reflfield.files import flush_to_disk, naming, replacing
+from reflfield.files import flush_to_disk, naming, read_bytes, replacing
 from reflfield.folders import flush_folder, folder_bytes, link_file, link_folder, remove
 from reflfield.scheduling import Blocks, Scheduler, Tally
 
@@ -43,6 +44,7 @@ log = logging.getLogger(__name__)
 # time that the result is used, and at the head of the report.
 WARNINGS = "warnings"
 RECORD = "stage.json"
+LARGEST_RECORD = 256 << 20
 KEY = "key"
 # Folders inside a stage's: results of blocks, removed when it is complete, and stores that
 # are written chunk by chunk and stay.
@@ -324,13 +326,11 @@ def plain(value: Any) -> Any:
 
 def read_record(folder: Path) -> dict[str, Any]:
     """What a stage's folder says of itself; empty if it does not, or is damaged."""
-    try:
-        text = (folder / RECORD).read_bytes()
-    except FileNotFoundError:
+    if not os.path.lexists(folder / RECORD):
         return {}
     try:
-        record = json.loads(text)
-    except (ValueError, RecursionError):
+        record = json.loads(read_bytes(folder / RECORD, LARGEST_RECORD))
+    except (InputError, ValueError, RecursionError):
         record = None
     if isinstance(record, dict) and is_stamped(record):
         return record
@@ -405,8 +405,10 @@ def take_place(partial: Path, folder: Path) -> None:
     The earlier folder loses its record before its files: killed in between, it is not taken
     for complete, and the finished one beside it takes its place in the next run.
     """
-    (folder / RECORD).unlink(missing_ok=True)
-    shutil.rmtree(folder, ignore_errors=True)
+    if os.path.lexists(folder / RECORD):
+        remove(folder / RECORD)
+    if os.path.lexists(folder):
+        remove(folder)
     partial.rename(folder)
     flush_to_disk(folder.parent)
     forget_blocks(folder)

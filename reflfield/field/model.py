@@ -55,6 +55,10 @@ INVERSE_POWER = {"cube_root": 3, "square_root": 2, "linear": 1}
 VISIBILITIES = ("kept", "factored")
 LIGHT_MODELS = ("known", "unknown")
 
+# Largest sample that a field may show, 1/sr, by the sum of its terms; sums of samples under
+# lights of any ordinary unit stay finite as singles.
+LARGEST_SAMPLE = 1e30
+
 _CODES = ("int8", "int16", "int32")
 
 # Stored arrays in file order: the dtypes allowed and the axes, by name. An axis
@@ -175,17 +179,32 @@ class ReflectanceField:
         check_finite("colour_factor", self.arrays["colour_factor"])
         with one_core_blas(), np.errstate(over="ignore", invalid="ignore"):
             table = unfactor_table(self.arrays)
-        check_finite("functions", table)
+        self._check_samples("functions", table, 1, self.coefficients)
         return np.ascontiguousarray(np.moveaxis(table, 1, 3))
 
     @cached_property
     def indirect(self) -> IndirectLight:
         """Indirect light, in the domain; see `field.indirect`."""
         functions, scale = (self.arrays[f"indirect_{n}"] for n in ("functions", "scale"))
-        check_finite("indirect_functions", functions)
-        check_finite("indirect_scale", scale)
         codes = self.arrays["indirect_coefficients"].astype(np.float32)
+        self._check_samples("indirect_functions", functions, 0, codes * scale)
         return IndirectLight(functions, codes * scale, self.observed_lights)
+
+    def _check_samples(
+        self, name: str, functions: NDArray[Any], axis: int, weights: NDArray[Any]
+    ) -> None:
+        """Demand functions, the mean first, whose weighted sums stay finite as samples."""
+        others = tuple(i for i in range(functions.ndim) if i != axis)
+        most = np.maximum(functions.max(axis=others), -functions.min(axis=others))
+        of_weights = np.maximum(weights.max(axis=0, initial=0), -weights.min(axis=0, initial=0))
+        bound = float(most[0] + most[1:].astype(np.float64) @ of_weights.astype(np.float64))
+        limit = LARGEST_SAMPLE ** (1.0 / self.inverse_power)
+        if not bound <= limit:  # nor is NaN
+            path = getattr(self.arrays, "path", None)
+            raise InputError(
+                f"{'' if path is None else f'{path}: '}{name}: expected finite numbers, in all "
+                f"at most {limit:.3g}, received {bound:.3g}; make the field again"
+            )
 
     @cached_property
     def observed_lights(self) -> NDArray[np.float64] | None:

@@ -173,11 +173,14 @@ class Projected:
         what they are: see `VALUE_KINDS`.
     measured : (n_texels, n_lights) bool
         True where some camera measured a value under the light.
+    brightest : float
+        Largest sample, 1/sr; 0 where everything is dark.
     """
 
     photographs: int
     values: NDArray[np.int64]
     measured: NDArray[np.bool_]
+    brightest: float
 
     def count(self, kind: str) -> int:
         """Values of one kind, all cameras together."""
@@ -224,14 +227,15 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         intact=has_views,
         at_once=at_once,
     )
-    n_photographs, values = 0, []
+    n_photographs, values, brightest = 0, [], 0.0
     measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
     for part in parts:
         n_photographs += int(part["photographs"])
         values.append(part["values"])
         measured |= part["measured"]
+        brightest = max(brightest, float(part["brightest"]))
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
-    found = Projected(n_photographs, np.concatenate(values), bits)
+    found = Projected(n_photographs, np.concatenate(values), bits, brightest)
     n_gaps = sum(found.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(found.values.sum()), 1))
     return found
@@ -246,7 +250,7 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
     measured = np.zeros((len(points), n_lights), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
-    n_read = 0
+    n_read, brightest = 0, 0.0
     for i, view in enumerate(views):
         seen = np.flatnonzero(projection.visible[:, view])
         for lights, values, kinds in _view_samples(
@@ -257,11 +261,13 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
             counts[i] += _counts_of(kinds)
             measured[seen[:, None], lights] |= IS_KNOWN[kinds].any(axis=2)
             n_read += len(lights)
+            brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
     store[:, views.start : views.stop] = block
     return {
         "photographs": np.array(n_read),
         "values": counts,
         "measured": np.packbits(measured, axis=1),
+        "brightest": np.array(brightest),
     }
 
 

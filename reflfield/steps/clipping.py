@@ -31,9 +31,17 @@ def check_measured(capture: Capture, found: Projected) -> None:
     Raises
     ------
     InputError
-        If no value was measured.
+        If no value was measured, or all are 0.
     """
-    if found.count("measured") or found.count("black") or not found.values.sum():
+    if not found.values.sum():
+        return
+    if found.count("measured") or found.count("black"):
+        if found.brightest <= 0.0:
+            raise InputError(
+                f"{capture.name}: photographs: everything is dark: expected values above 0 "
+                f"where cameras see the object, received {int(found.values.sum())} that are "
+                "all 0; expose longer, and check lights, encoding and silhouettes"
+            )
         return
     if not any(light.intensity.any() for light in capture.lights):
         raise InputError(

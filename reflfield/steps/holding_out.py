@@ -194,7 +194,8 @@ def spread_photographs(views: Indices, lights: Indices, count: int) -> Bools:
     """
     if count >= len(views):
         raise InputError(
-            f"--hold-out: expected fewer than the {len(views)} photographs, received {count}"
+            f"--hold-out: expected fewer than {_all_of(len(views), 'photographs')}, "
+            f"received {count}"
         )
     ranks = [np.unique(ids, return_inverse=True) for ids in (views, lights)]
     first, second = sorted(ranks, key=lambda rank: -len(rank[0]))
@@ -207,6 +208,10 @@ def spread_photographs(views: Indices, lights: Indices, count: int) -> Bools:
         distance = np.where(chosen, np.inf, along + 0.999 * across)
         chosen[order[np.argmin(distance[order])]] = True
     return chosen
+
+
+def _all_of(total: int, what: str) -> str:
+    return f"the only {what.removesuffix('s')}" if total == 1 else f"the {total} {what}"
 
 
 def evenly_spread(count: int, total: int, what: str) -> Indices:
@@ -224,7 +229,7 @@ def evenly_spread(count: int, total: int, what: str) -> Indices:
     """
     if count and count >= total:
         raise InputError(
-            f"--hold-out: expected fewer than the {total} {what}, received {count}"
+            f"--hold-out: expected fewer than {_all_of(total, what)}, received {count}"
         )
     return ((np.arange(count) + 0.5) * total / max(count, 1)).astype(np.intp)
 
