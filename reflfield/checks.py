@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,6 +12,26 @@ from reflfield.errors import InputError, ShapeError
 # A direction read from a text file with six digits is unit to about 1e-6;
 # anything farther off is another quantity, not rounding.
 UNIT_TOLERANCE = 1e-4
+
+
+def check_ranges(options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Demand numbers between a least and a most, both included, of some attributes.
+
+    Raises
+    ------
+    InputError
+        Names the first one outside.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> check_ranges(SimpleNamespace(blur=0.7), {"blur": (0, 100)})
+    """
+    for name, (least, most) in ranges.items():
+        if not least <= getattr(options, name) <= most:
+            raise InputError(
+                f"{name}: expected {least} to {most}, received {getattr(options, name)}"
+            )
 
 
 def check_shape(

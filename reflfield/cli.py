@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -43,7 +44,21 @@ errors = Console(stderr=True, highlight=False)
 MISSED = 3  # status where the quality that was asked for is not reached
 GOES_ON = "the same command goes on where it stopped"
 
-Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the results.")]
+
+def results_folder(name: str | Path) -> Path:
+    """Folder of a name; none and the root come of a variable of the shell that is not set."""
+    whole = Path(os.path.normpath(Path.cwd() / name))
+    if not str(name).strip() or whole == whole.parent:
+        raise typer.BadParameter(f"expected a folder for results, received {str(name)!r}")
+    return Path(name)
+
+
+Out = Annotated[
+    Path,
+    typer.Option(
+        "-o", "--out", metavar="FOLDER", parser=results_folder, help="Folder for the results."
+    ),
+]
 Format = Annotated[
     str | None,
     typer.Option(help="native, transforms, middlebury or lp; detected by content if absent."),

@@ -23,6 +23,8 @@ from reflfield.files import read_bytes
 Options = TypeVar("Options")
 # A configuration file is written by hand: anything larger is another file.
 LARGEST_FILE = 1 << 20
+# Keys of very many parts take time and memory that grow with the square of their number.
+LONGEST_LINE = 4096
 # Whole numbers that fit 63 bits, and what else is said of values in messages.
 LARGEST_WHOLE = (1 << 63) - 1
 LONGEST_SHOWN = 100
@@ -43,6 +45,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         If the file cannot be read, is no regular one, or is not TOML; the message names it.
     """
     content = read_bytes(path, LARGEST_FILE)
+    if max(map(len, content.splitlines()), default=0) > LONGEST_LINE:
+        raise InputError(
+            f"{path}: expected options in TOML, received a line of more than {LONGEST_LINE} bytes"
+        )
     try:
         return tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # ValueError also of numbers without end
@@ -87,6 +93,8 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 
 def _toml_value(text: str) -> Any:
+    if len(text) > LONGEST_LINE:
+        return text
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):  # ValueError also of numbers without end

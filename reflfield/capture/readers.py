@@ -118,8 +118,9 @@ def _read(description: Path, format: str, *, follow_links: bool, test_split: boo
         )
     if test_split:
         raise CaptureError(
-            f"{description}: expected transforms.json with a test split, received a "
-            f"{format} capture, which has none; hold out views, lights or photographs instead"
+            f"{description}: --hold-out test: expected transforms.json with a test split, "
+            f"received a {format} capture, which has none; hold out views=K, lights=K or "
+            "photographs=K instead"
         )
     return READERS[format].read(description, follow_links=follow_links)
 

@@ -156,8 +156,8 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
     total = memory_needed(shapes, {name: array.n_bytes for name, array in declared.items()})
     if total > max_bytes:
         raise FieldFileError(
-            f"{path}: expected arrays of at most {max_bytes:,} bytes, the header declares "
-            f"some that take {total:,.0f}; raise --max-memory (in Python max_bytes) if the "
+            f"{path}: expected arrays of at most {max_bytes} bytes, the header declares "
+            f"some that take {total:.0f}; raise --max-memory (in Python max_bytes) if the "
             "file is to be trusted"
         )
     with _naming(path):

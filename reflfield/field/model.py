@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.checks import unit_direction
-from reflfield.errors import InputError, ShapeError
+from reflfield.errors import FieldFileError, InputError, ShapeError
 from reflfield.field.indirect import IndirectLight
 from reflfield.field.observed_sphere import MOST_OBSERVED
 from reflfield.field.quantisation import (
@@ -57,7 +57,7 @@ LIGHT_MODELS = ("known", "unknown")
 
 # Largest sample that a field may show, 1/sr, by the sum of its terms; sums of samples under
 # lights of any ordinary unit stay finite as singles.
-LARGEST_SAMPLE = 1e30
+LARGEST_SAMPLE = 1e33
 
 _CODES = ("int8", "int16", "int32")
 
@@ -200,11 +200,12 @@ class ReflectanceField:
         bound = float(most[0] + most[1:].astype(np.float64) @ of_weights.astype(np.float64))
         limit = LARGEST_SAMPLE ** (1.0 / self.inverse_power)
         if not bound <= limit:  # nor is NaN
-            path = getattr(self.arrays, "path", None)
-            raise InputError(
-                f"{'' if path is None else f'{path}: '}{name}: expected finite numbers, in all "
-                f"at most {limit:.3g}, received {bound:.3g}; make the field again"
+            wrong = (
+                f"{name}: expected finite numbers, in all at most {limit:.3g}, received "
+                f"{bound:.3g}; make the field again"
             )
+            path = getattr(self.arrays, "path", None)
+            raise InputError(wrong) if path is None else FieldFileError(f"{path}: {wrong}")
 
     @cached_property
     def observed_lights(self) -> NDArray[np.float64] | None:

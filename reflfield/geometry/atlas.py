@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.checks import check_shape
+from reflfield.checks import check_ranges, check_shape
 from reflfield.children import tied
 from reflfield.errors import GeometryError, InputError, ReflfieldError
 from reflfield.geometry.box_charts import box_charts
@@ -24,6 +24,10 @@ from reflfield.geometry.mesh import Mesh
 Array = NDArray[np.float64]
 
 _METHODS = ("xatlas", "boxes")
+# Side of a texture: more texels than photographs have pixels.
+LARGEST_TEXTURE = 1 << 15
+# Seconds beyond a week are a slip, and more than the system can wait for.
+_RANGES = {"padding": (0, 64), "time_limit_s": (0, 1e6), "max_cost": (-1e6, 1e6)}
 
 # Triangles that xatlas unwraps in at most a few minutes of one core, however rough they are:
 # 20,000 take 2 to 13 s, 80,000 smooth ones 23 s.
@@ -66,15 +70,14 @@ class AtlasOptions:
             raise InputError(
                 f"method: expected one of {', '.join(_METHODS)}, received {self.method!r}"
             )
-        if (
-            (self.resolution != 0 and self.resolution < 4)
-            or self.padding < 0
-            or not self.time_limit_s > 0
-        ):
+        if self.resolution != 0 and not 4 <= self.resolution <= LARGEST_TEXTURE:
             raise InputError(
-                "atlas: expected resolution >= 4, padding >= 0 and time_limit_s > 0, received "
-                f"{self.resolution}, {self.padding} and {self.time_limit_s}"
+                f"resolution: expected 4 to {LARGEST_TEXTURE} texels, or 0 for a density of "
+                f"texels, received {self.resolution}"
             )
+        check_ranges(self, _RANGES)
+        if not self.time_limit_s > 0:
+            raise InputError(f"time_limit_s: expected > 0, received {self.time_limit_s}")
 
 
 @dataclass(frozen=True, eq=False)

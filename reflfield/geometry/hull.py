@@ -20,6 +20,7 @@ from skimage.measure import marching_cubes
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.names import listed
+from reflfield.checks import check_ranges
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.bounding_box import object_bounds
 from reflfield.geometry.carving import Grid, carve
@@ -39,6 +40,14 @@ from reflfield.geometry.specks import noting_small_parts, specks_words, without_
 
 Array = NDArray[np.float64]
 
+_MOST_VIEWS = 100_000
+# Blur takes memory, smoothing time; the smallest component is a share of the largest.
+_RANGES = {
+    "blur": (0, 100),
+    "smoothing": (0, 10_000),
+    "n_triangles": (0, 10_000_000),
+    "minimum_component": (0, 1),
+}
 _LARGEST_RESOLUTION = 512
 # What `tolerance` is by default.
 AUTO: Literal["auto"] = "auto"
@@ -98,9 +107,9 @@ class HullOptions:
             raise InputError(
                 f"tolerance: expected a number of views or 'auto', received {self.tolerance!r}"
             )
-        for name in ("tolerance", "blur", "smoothing", "n_triangles", "minimum_component"):
-            if getattr(self, name) != AUTO and getattr(self, name) < 0:
-                raise InputError(f"{name}: expected >= 0, received {getattr(self, name)}")
+        if self.tolerance != AUTO:
+            check_ranges(self, {"tolerance": (0, _MOST_VIEWS)})
+        check_ranges(self, _RANGES)
         if self.bounds is not None and not np.less(*self.bounds).all():
             raise InputError(
                 f"bounds: expected lowest < highest corner, received {self.bounds[0]}, "

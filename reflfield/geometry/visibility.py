@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import Light
-from reflfield.checks import check_shape
+from reflfield.checks import check_ranges, check_shape
 from reflfield.errors import InputError
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.ray_scene import RayScene, row_strips
@@ -23,6 +23,13 @@ from reflfield.geometry.texels import TexelTable
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+# Pixels, and a share of the object's diagonal.
+_RANGES = {
+    "edge_band": (0, 1e6),
+    "edge_slope": (0, 1e6),
+    "shadow_band": (0, 1e6),
+    "ray_offset": (0, 0.1),
+}
 # Lights that come from everywhere or from nowhere known: no single ray can miss them.
 _WITHOUT_DIRECTION = ("environment", "unknown")
 
@@ -65,9 +72,7 @@ class VisibilityOptions:
                 raise InputError(
                     f"{name}: expected a number in [0, 1), received {getattr(self, name)}"
                 )
-        for name in ("edge_band", "edge_slope", "ray_offset", "shadow_band"):
-            if not getattr(self, name) >= 0.0:
-                raise InputError(f"{name}: expected >= 0, received {getattr(self, name)}")
+        check_ranges(self, _RANGES)
 
 
 def lifted_positions(texels: TexelTable, scene: RayScene, options: VisibilityOptions) -> Array:
@@ -318,5 +323,6 @@ def _jumps(depth: Array, footprint: Array, options: VisibilityOptions) -> Bools:
     one_misses = np.isfinite(left) != np.isfinite(right)
     both_hit = np.isfinite(left) & np.isfinite(right)
     step = np.abs(np.subtract(left, right, out=np.zeros_like(left), where=both_hit))
-    limit = options.edge_slope * np.minimum(footprint[:, :-1], footprint[:, 1:])
+    nearer = np.minimum(footprint[:, :-1], footprint[:, 1:])
+    limit = options.edge_slope * np.where(both_hit, nearer, 0.0)
     return one_misses | (both_hit & (step > limit))

@@ -79,8 +79,10 @@ class ResamplingOptions:
         if self.domain not in POWERS:
             known = list(POWERS)
             raise InputError(f"domain: expected one of {known}, received {self.domain!r}")
-        if not self.smoothness > 0:
-            raise InputError(f"smoothness: expected > 0, received {self.smoothness}")
+        if not 0 < self.smoothness <= 1e6:
+            raise InputError(
+                f"smoothness: expected > 0, at most 1e6, received {self.smoothness}"
+            )
         if self.visibility not in ("factored", "kept", "auto"):
             raise InputError(
                 "visibility: expected 'factored', 'kept' or 'auto', received "

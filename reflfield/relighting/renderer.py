@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import ENVIRONMENT, UNKNOWN, Light
+from reflfield.checks import check_ranges
 from reflfield.config import MOST_WORKERS, available_cores
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate, sum_lights
@@ -88,11 +89,7 @@ class RenderOptions:
     ray_offset: float = 2e-4
 
     def __post_init__(self) -> None:
-        for name, (least, most) in RANGES.items():
-            if not least <= getattr(self, name) <= most:
-                raise InputError(
-                    f"{name}: expected {least} to {most}, received {getattr(self, name)}"
-                )
+        check_ranges(self, RANGES)
         if isqrt(self.samples_per_pixel) ** 2 != self.samples_per_pixel:
             raise InputError(
                 f"samples_per_pixel: expected a square number, "

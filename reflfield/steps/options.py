@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from reflfield.checks import check_ranges
 from reflfield.errors import InputError
 from reflfield.field.compression import CompressionOptions
-from reflfield.geometry.atlas import AtlasOptions
+from reflfield.geometry.atlas import LARGEST_TEXTURE, AtlasOptions
 from reflfield.geometry.hull import HullOptions
 from reflfield.geometry.visibility import VisibilityOptions
 from reflfield.observations.resampling import ResamplingOptions
@@ -37,10 +38,7 @@ class TextureOptions:
             raise InputError(
                 f"texels_per_pixel: expected > 0, received {self.texels_per_pixel}"
             )
-        if self.largest < SMALLEST_TEXTURE:
-            raise InputError(
-                f"largest: expected at least {SMALLEST_TEXTURE}, received {self.largest}"
-            )
+        check_ranges(self, {"largest": (SMALLEST_TEXTURE, LARGEST_TEXTURE)})
 
 
 @dataclass(frozen=True)
@@ -113,9 +111,9 @@ class AlignmentOptions:
     least_margin: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("band_limit", "iterations", "n_clusters"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, received {getattr(self, name)}")
+        check_ranges(
+            self, {"band_limit": (1, 64), "iterations": (1, 1000), "n_clusters": (1, 65_536)}
+        )
         if not 0 < self.max_tilt_deg <= 180:
             raise InputError(f"max_tilt_deg: expected (0, 180], received {self.max_tilt_deg}")
         if not self.spread_deg > 0:
@@ -141,11 +139,7 @@ class IndirectOptions:
     training_texels: int = 4096
 
     def __post_init__(self) -> None:
-        for name, least in (("n_components", 0), ("training_texels", 1)):
-            if getattr(self, name) < least:
-                raise InputError(
-                    f"{name}: expected at least {least}, received {getattr(self, name)}"
-                )
+        check_ranges(self, {"n_components": (0, 1024), "training_texels": (1, 1 << 24)})
 
 
 @dataclass(frozen=True)

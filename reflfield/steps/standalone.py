@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -125,7 +126,7 @@ def check_kept(frames: Capture, written: Iterable[Path]) -> None:
     read |= {path.resolve() for path in frames.silhouettes if path is not None}
     read |= {light.file.resolve() for light in frames.lights if light.file is not None}
     for path in written:
-        if path.resolve() in read:
+        if Path(os.path.realpath(path)) in read:
             raise InputError(
                 f"{path}: expected a folder for results where no file of the frames is "
                 "replaced, received one with this file; choose another folder"

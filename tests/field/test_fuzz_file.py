@@ -358,3 +358,21 @@ def test_deep_headers_are_refused(path, tmp_path):
             archive.writestr(name, content)
     with pytest.raises(FieldFileError, match=r"deep\.rfld: damaged reflectance field"):
         open_field(tmp_path / "deep.rfld")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "what"),
+    [
+        ("function_gain", 1e20, "functions"),
+        ("coefficient_scale", 1e24, "functions"),
+        ("core_scale", 1e24, "functions"),
+        ("indirect_scale", 1e24, "indirect_functions"),
+        ("indirect_functions", 1e24, "indirect_functions"),
+    ],
+)
+def test_finite_values_whose_samples_overflow(path, name, value, what):
+    opened = open_field(path)
+    with_array(path, name, np.full_like(opened.arrays[name], value))
+    spoilt = open_field(path)
+    with pytest.raises(FieldFileError, match=rf"field\.rfld: {what}: expected finite numbers"):
+        _ = spoilt.node_table, spoilt.indirect
