@@ -47,7 +47,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     content = read_bytes(path, LARGEST_FILE)
     if max(map(len, content.splitlines()), default=0) > LONGEST_LINE:
         raise InputError(
-            f"{path}: expected options in TOML, received a line of more than {LONGEST_LINE} bytes"
+            f"{path}: expected options in TOML, received a line of more "
+            f"than {LONGEST_LINE} bytes"
         )
     try:
         return tomllib.loads(content.decode("utf-8-sig"))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reflfield.checks import check_ranges
 from reflfield.errors import InputError
 from reflfield.factorization import Completion, LocalPCA
 from reflfield.field.fit import ClusteredModel, SampleFitOptions
@@ -92,8 +93,7 @@ class CompressionOptions:
                 f"size, psnr: expected one of them, received {self.size} bytes and "
                 f"{self.psnr} dB"
             )
-        if not 0 < self.coarseness < float("inf"):
-            raise InputError(f"coarseness: expected > 0, received {self.coarseness}")
+        check_ranges(self, {"coarseness": (1e-3, 1e3)})
 
     def fits_samples(self, n_samples: float) -> bool:
         """Whether to fit to the samples, of which a texel has `n_samples` on average.

@@ -23,6 +23,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.checks import check_ranges
 from reflfield.errors import InputError
 from reflfield.observations.resampling import ALL_CHANNELS, Channels, RootedSamples
 from reflfield.progress import report, track
@@ -83,12 +84,7 @@ class SampleFitOptions:
                     f"{name}: expected at least 1 and at most {most}, "
                     f"received {getattr(self, name)}"
                 )
-        if not self.smoothness >= 0:
-            raise InputError(f"smoothness: expected >= 0, received {self.smoothness}")
-        if not self.frame_spread_deg >= 0:
-            raise InputError(
-                f"frame_spread_deg: expected >= 0, received {self.frame_spread_deg}"
-            )
+        check_ranges(self, {"smoothness": (0, 1e6), "frame_spread_deg": (0, 180)})
 
     def halves(self) -> tuple[SampleFitOptions, SampleFitOptions]:
         """Rounds before and after the frames are improved, one at least of each.

@@ -28,6 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.errors import InputError
+
 Floats = NDArray[np.float64]
 
 FACTORS = ("function", "view", "light")
@@ -143,6 +145,11 @@ def _drop_empty(arrays: dict[str, Any]) -> None:
 def smallest_codes(array: NDArray[Any]) -> NDArray[Any]:
     """Integers in the smallest signed type that holds them; other arrays unchanged.
 
+    Raises
+    ------
+    InputError
+        If one needs more than 32 bits.
+
     Examples
     --------
     >>> smallest_codes(np.array([1, -200])).dtype
@@ -151,8 +158,14 @@ def smallest_codes(array: NDArray[Any]) -> NDArray[Any]:
     if array.dtype.kind != "i":
         return array
     largest = int(np.abs(array.astype(np.int64)).max(initial=0))
-    kinds = (kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max)
-    return np.ascontiguousarray(array, dtype=next(kinds))
+    kinds = [kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max]
+    if not kinds:
+        raise InputError(
+            f"quantisation: expected steps whose codes fit 32 bits, received some of "
+            f"{largest}; "
+            "make them coarser (compression.coarseness)"
+        )
+    return np.ascontiguousarray(array, dtype=kinds[0])
 
 
 def lattice_codes(

@@ -116,8 +116,8 @@ class AlignmentOptions:
         )
         if not 0 < self.max_tilt_deg <= 180:
             raise InputError(f"max_tilt_deg: expected (0, 180], received {self.max_tilt_deg}")
-        if not self.spread_deg > 0:
-            raise InputError(f"spread_deg: expected > 0, received {self.spread_deg}")
+        if not 0 < self.spread_deg <= 180:
+            raise InputError(f"spread_deg: expected (0, 180], received {self.spread_deg}")
 
 
 @dataclass(frozen=True)

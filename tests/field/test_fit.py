@@ -493,8 +493,8 @@ class TestFit:
         ({"iterations": 0}, "iterations: expected at least 1"),
         ({"fineness": 0.5}, "fineness: expected at least 1, received 0.5"),
         ({"fineness": float("nan")}, "fineness: expected at least 1, received nan"),
-        ({"smoothness": -1.0}, "smoothness: expected >= 0"),
-        ({"smoothness": float("nan")}, "smoothness: expected >= 0"),
+        ({"smoothness": -1.0}, "smoothness: expected 0 to"),
+        ({"smoothness": float("nan")}, "smoothness: expected 0 to"),
     ],
 )
 def test_options_are_checked(changes, message):

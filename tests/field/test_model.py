@@ -22,7 +22,12 @@ from reflfield.field.quantisation import (
     lattice_points,
     rotations_from_codes,
 )
-from reflfield.field.transform import factor_table, lattice_codes, unfactor_table
+from reflfield.field.transform import (
+    factor_table,
+    lattice_codes,
+    smallest_codes,
+    unfactor_table,
+)
 from reflfield.sphere.rotations import matrix_from_quaternion, rotation_angle
 
 
@@ -258,3 +263,8 @@ def test_unknown_options_are_refused(parts):
         Quantisation(step=-1.0)
     with pytest.raises(InputError, match="visibility"):
         build_field(*parts, visibility="sometimes")
+
+
+def test_codes_beyond_32_bits_are_refused():
+    with pytest.raises(InputError, match="expected steps whose codes fit 32 bits"):
+        smallest_codes(np.array([1, -(2**31)]))
