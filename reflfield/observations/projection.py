@@ -161,6 +161,35 @@ class Projection:
 
 
 @dataclass(frozen=True, eq=False)
+class LookedInto:
+    """Samples (n) of a few photographs.
+
+    Parameters
+    ----------
+    photograph, texel : (n,) int64
+        Indices.
+    values : (n, 3) float32
+        Radiance over the light's irradiance; NaN where nothing is known of it.
+    measured : (n, 3) bool
+        False where a value is a bound, or known without the photograph.
+    """
+
+    photograph: NDArray[np.int64]
+    texel: NDArray[np.int64]
+    values: Floats
+    measured: NDArray[np.bool_]
+
+    def brightness(self) -> NDArray[np.float64]:
+        """Mean (n,) of the channels that are known; NaN where none is."""
+        known = np.isfinite(self.values)
+        total = np.where(known, self.values, 0.0).sum(axis=1, dtype=np.float64)
+        mean: NDArray[np.float64] = np.where(
+            known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan
+        )
+        return mean
+
+
+@dataclass(frozen=True, eq=False)
 class Projected:
     """What the projection found in the photographs.
 
@@ -175,12 +204,15 @@ class Projected:
         True where some camera measured a value under the light.
     brightest : float
         Largest sample, 1/sr; 0 where everything is dark.
+    looked_into : LookedInto
+        Some of the samples.
     """
 
     photographs: int
     values: NDArray[np.int64]
     measured: NDArray[np.bool_]
     brightest: float
+    looked_into: LookedInto
 
     def count(self, kind: str) -> int:
         """Values of one kind, all cameras together."""
@@ -217,8 +249,8 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
     Every photograph is read once, a few of them (`PHOTOGRAPHS_FOR_UNIT`) before, to choose the
     unit of the samples.
     """
-    chosen = blocks.once("unit", lambda: {"unit": np.array(sample_unit(projection))})
-    create_samples(projection.location, *projection.shape, float(chosen["unit"]))
+    first = LookedInto(**blocks.once("first", lambda: vars(look_into(projection))))
+    create_samples(projection.location, *projection.shape, sample_unit(first))
     parts = blocks.map(
         "projecting photographs",
         project_views,
@@ -235,7 +267,7 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
-    found = Projected(n_photographs, np.concatenate(values), bits, brightest)
+    found = Projected(n_photographs, np.concatenate(values), bits, brightest, first)
     n_gaps = sum(found.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(found.values.sum()), 1))
     return found
@@ -284,34 +316,31 @@ def has_views(projection: Projection, views: range) -> bool:
     return is_written(store, (slice(None), slice(views.start, views.stop)))
 
 
-def sample_unit(projection: Projection) -> float:
-    """Unit in which halves hold the samples of a capture: a power of 64.
-
-    Cube and square root of such a power are powers of two, so that no digit changes whatever
-    the domain of the factorization is. Samples of ordinary captures, whose median is near
-    `USUAL_SAMPLE`, are stored as they are, in units of 1.
-
-    Parameters
-    ----------
-    projection : Projection
-        A few of its photographs are looked at, evenly spread over the capture.
-
-    Returns
-    -------
-    float
-    """
+def look_into(projection: Projection) -> LookedInto:
+    """Samples of a few photographs, spread evenly over the capture, at texels spread so."""
     capture, n = projection.capture, len(projection.capture.photographs)
     chosen = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
-    found = [np.zeros(0, np.float32)]
-    for photograph in (capture.photographs[i] for i in chosen):
+    found = []
+    for index in chosen:
+        photograph = capture.photographs[index]
         seen = np.flatnonzero(projection.visible[:, photograph.camera])
         some = seen[:: max(1, len(seen) // TEXELS_FOR_UNIT)]
         points = np.asarray(projection.positions[some], np.float64)
         pixels, _ = capture.cameras[photograph.camera].project(points)
         lights = np.array([photograph.light])
         values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
-        found.append(values[(kinds == 0) & (values > 0)])
-    positive = np.concatenate(found)
+        found.append((np.full(len(some), index), some, values[:, 0], kinds[:, 0] == 0))
+    return LookedInto(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def sample_unit(looked_into: LookedInto) -> float:
+    """Unit in which halves hold the samples of a capture: a power of 64.
+
+    Cube and square root of such a power are powers of two, so that no digit changes whatever
+    the domain of the factorization is. Samples of ordinary captures, whose median is near
+    `USUAL_SAMPLE`, are stored as they are, in units of 1.
+    """
+    positive = looked_into.values[looked_into.measured & (looked_into.values > 0)]
     if not len(positive):
         return 1.0
     size = float(np.median(positive.astype(np.float64)))

@@ -31,8 +31,10 @@ from reflfield.field.file import open_field, write_field
 from reflfield.field.fit import (
     ClusteredModel,
 )
+from reflfield.observations.light_agreement import looks_at, other_light_axes
 from reflfield.observations.projection import (
     VALUE_KINDS,
+    LookedInto,
     Projection,
     project_photographs,
 )
@@ -42,7 +44,7 @@ from reflfield.observations.store import open_samples
 from reflfield.scheduling import Blocks
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit
-from reflfield.stages import plain
+from reflfield.stages import WARNINGS, plain
 from reflfield.steps.clipping import check_measured, clipping_lines, write_measured
 from reflfield.steps.columns import Inference, Resampling, half_columns, inferred
 from reflfield.steps.fitting import AlignedFrames, Resampled, fitted_model, local_frames
@@ -81,7 +83,23 @@ def write_observations(job: Job, folder: Path) -> dict[str, Any]:
         "samples": n_samples,
         "raw bytes": n_samples * 6,
         **{f"values {kind}": found.count(kind) for kind in VALUE_KINDS},
+        WARNINGS: misread_lights(job, found.looked_into),
     }
+
+
+def misread_lights(job: Job, samples: LookedInto) -> list[str]:
+    """A warning where the lights are plainly in other axes than the cameras."""
+    if job.is_plane:  # all its points face one way
+        return []
+    looks = looks_at(
+        job.training,
+        samples.photograph,
+        job.texels.position[samples.texel],
+        job.texels.normal[samples.texel],
+        samples.brightness(),
+    )
+    words = other_light_axes(list(looks))
+    return [words] if words else []
 
 
 def lost_observations(job: Job, folder: Path) -> str:

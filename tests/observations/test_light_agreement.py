@@ -1,0 +1,108 @@
+"""Lights that are described in other axes than the cameras are noticed in the photographs."""
+
+import re
+
+import numpy as np
+import pytest
+
+from reflfield.capture.cameras import Camera, looking_at
+from reflfield.capture.lights import Light
+from reflfield.observations.light_agreement import (
+    Look,
+    agreement,
+    other_light_axes,
+)
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+def as_they_are(vector, camera, is_position):
+    return vector
+
+
+def directions(rng, n):
+    found = rng.normal(size=(n, 3))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def photographed(rng, described, kind="point", n_looks=12):
+    """Looks at a matt ball, each from one side under a lamp elsewhere that is told otherwise.
+
+    `described` makes what a description says of the lamp (its vector, the camera).
+    """
+    looks = []
+    for i in range(n_looks):
+        pose = looking_at(3 * directions(rng, 1)[0], (0, 0, 0), (0, 0, 1))
+        camera = Camera(f"v{i}", "opencv", 8, 8, 8.0, 8.0, 4.0, 4.0, pose)
+        lamp = directions(rng, 1)[0] * (4.0 if kind == "point" else 1.0)
+        normals = directions(rng, 600)
+        normals = normals[(camera.centre * normals).sum(axis=1) > 1]  # the side that is seen
+        towards = lamp - normals if kind == "point" else np.tile(lamp, (len(normals), 1))
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        brightness = np.maximum((towards * normals).sum(axis=1), 0)
+        said = described(lamp, camera)
+        place = {"position": said} if kind == "point" else {"direction": said}
+        looks.append(Look(camera, Light(f"l{i}", kind, **place), normals, normals, brightness))
+    return looks
+
+
+def in_camera(axes):
+    def told(lamp, camera):
+        return axes @ (camera.camera_from_world[:3, :3] @ (lamp - camera.centre))
+
+    return told
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_lights_as_described_fit(rng, kind):
+    looks = photographed(rng, lambda lamp, camera: lamp, kind)
+    # Brightness is the cosine itself; looks from behind the lamp have hardly any of it.
+    assert agreement(looks, as_they_are) > 0.6
+    assert other_light_axes(looks) == ""
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (lambda lamp: lamp[[0, 2, 1]] * [1, 1, -1], r"read as \(x, -z, y\)"),  # y is up
+        (lambda lamp: lamp * [1, 1, -1], r"read as \(x, y, -z\)"),  # mirrored
+        (lambda lamp: lamp[[1, 2, 0]], r"read as \(z, x, y\)"),
+    ],
+)
+def test_other_axes_are_named(rng, kind, told, words):
+    state = rng.bit_generator.state
+    right = agreement(photographed(rng, lambda lamp, camera: lamp, kind), as_they_are)
+    rng.bit_generator.state = state
+    looks = photographed(rng, lambda lamp, camera: told(lamp), kind)
+    expected = rf"do not fit.* but of {right:.2f} with the lights' coordinates {words}"
+    assert re.search(expected, other_light_axes(looks))
+
+
+@pytest.mark.parametrize(("axes", "name"), [(np.eye(3), "OpenCV"), (OPENGL, "OpenGL")])
+def test_positions_in_the_axes_of_each_camera_are_named(rng, axes, name):
+    words = other_light_axes(photographed(rng, in_camera(axes)))
+    assert words.startswith("lights and photographs do not fit")
+    assert f"in the camera's axes of {name}" in words
+
+
+def test_brightness_of_the_opposite_side_fits_no_axes(rng):
+    """A picture that is turned, say; by another rule of axes it would fit no better."""
+    looks = photographed(rng, lambda lamp, camera: lamp)
+    shuffled = [
+        Look(look.camera, look.light, look.points, look.normals, 1 - np.sqrt(look.brightness))
+        for look in looks
+    ]
+    words = other_light_axes(shuffled)
+    assert "with a correlation of -" in words
+
+
+def test_unknown_lights_flat_surfaces_and_few_points_say_nothing(rng):
+    looks = photographed(rng, lambda lamp, camera: -lamp, n_looks=3)
+    unknown = [
+        Look(k.camera, Light("l", "unknown"), k.points, k.normals, k.brightness) for k in looks
+    ]
+    few = [
+        Look(k.camera, k.light, k.points[:9], k.normals[:9], k.brightness[:9]) for k in looks
+    ]
+    assert other_light_axes(unknown) == other_light_axes(few) == ""
