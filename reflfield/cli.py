@@ -42,6 +42,7 @@ app = typer.Typer(
 )
 errors = Console(stderr=True, highlight=False)
 MISSED = 3  # status where the quality that was asked for is not reached
+LONGEST_MESSAGE = 1600
 GOES_ON = "the same command goes on where it stopped"
 
 
@@ -119,7 +120,10 @@ class Notes(logging.Handler):
 def fail(message: str, error: Exception) -> NoReturn:
     """Say what is wrong, and what was noted on the error, and end with status 2."""
     notes = getattr(error, "__notes__", ())
-    say_error(f"reflfield: error: {'; '.join([message, *notes])}")
+    whole = "; ".join([message, *notes])
+    if len(whole) > LONGEST_MESSAGE:  # arguments and names are quoted in it
+        whole = f"{whole[: LONGEST_MESSAGE // 2]} ... {whole[-LONGEST_MESSAGE // 4 :]}"
+    say_error(f"reflfield: error: {whole}")
     sys.exit(2)
 
 
