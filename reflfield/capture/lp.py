@@ -67,6 +67,8 @@ def read_lp(
     check_counts(str(description), 1, len(lines) - 1, len(lines) - 1)
     parsed = [_parsed(line, description) for line in lines[1:]]
     paths = [files.path_by_last_parts(name) for name, _ in parsed]
+    for (name, _), path in zip(parsed, paths, strict=True):
+        _check_no_more_numbers(name, path, description)
     names = unique_names(paths, root)
     notes = _behind([direction for _, direction in parsed], description)
     lights = tuple(
@@ -88,6 +90,17 @@ def read_lp(
         description=description,
         notes=notes,
     )
+
+
+def _check_no_more_numbers(name: str, path: Path, description: Path) -> None:
+    """Refuse lines that go on behind the direction, as with intensities."""
+    words = name.split()
+    if len(words) > 1 and parse_number(words[-1]) is not None and not path.exists():
+        raise CaptureError(
+            f"{description}: expected a file name and three numbers, light direction x y z, "
+            f"received more numbers in the line of {quoted(name)}; leave the direction alone, "
+            "or write capture.json, whose lights have an 'irradiance' each"
+        )
 
 
 def _behind(directions: list[list[float]], description: Path) -> tuple[str, ...]:

@@ -66,6 +66,14 @@ class TestLp:
         with pytest.raises(CaptureError, match=r"dome\.lp: .*z > 0, received [23] of 3"):
             self.opened(tmp_path, *(f"1.png {light}" for light in lights))
 
+    @pytest.mark.parametrize("more", ["1.0", "1 .9 .8"])
+    def test_intensities_behind_the_direction_are_said(self, tmp_path, more):
+        photograph(tmp_path / "a 1.png")
+        with pytest.raises(
+            CaptureError, match=r"dome\.lp: .*more numbers in the line of 'a 1.png"
+        ):
+            self.opened(tmp_path, f"a 1.png 0 0 1 {more}")
+
     def test_few_lights_behind_the_picture_are_noted(self, tmp_path):
         for i in range(8):
             photograph(tmp_path / f"{i}.png")

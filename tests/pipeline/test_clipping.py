@@ -10,7 +10,7 @@ from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture
 from reflfield.errors import InputError
-from reflfield.observations.projection import VALUE_KINDS, Projected
+from reflfield.observations.projection import VALUE_KINDS, LookedInto, Projected
 from reflfield.steps.clipping import (
     check_measured,
     clipping_lines,
@@ -33,7 +33,9 @@ def projected(**kinds):
     values = np.zeros((2, len(VALUE_KINDS)), np.int64)
     for kind, counts in kinds.items():
         values[:, VALUE_KINDS.index(kind)] = counts
-    return Projected(2, values, np.ones((3, 1), bool))
+    none = np.zeros(0, np.int64)
+    nothing = LookedInto(none, none, np.zeros((0, 3), np.float32), np.zeros((0, 3), bool))
+    return Projected(2, values, np.ones((3, 1), bool), 1.0, nothing)
 
 
 def test_worst_camera_is_named_where_more_than_a_trace_is_saturated(capture):
