@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from reflfield.checks import check_ranges
 from reflfield.errors import InputError
+from reflfield.field.bounds import exceeds, probes, raise_top
 from reflfield.observations.resampling import ALL_CHANNELS, Channels, RootedSamples
 from reflfield.progress import report, track
 
@@ -39,6 +40,12 @@ N_PARTS = 8
 USUAL_SIZE = 0.35
 # Squares of this size stand for zero; far below what any unit of the data gives.
 LEAST_ENERGY = 1e-200
+
+
+# The prior of a texel beyond its bounds grows by this, so many times at most.
+STRENGTHENING, STRENGTHENINGS = 4.0, 8
+# Standard deviations that coefficients may thereby differ from what the samples give.
+ALLOWED_DEVIATION = 3.0
 
 
 # Largest values of options; beyond them a run takes days, or no machine holds the tables.
@@ -243,6 +250,38 @@ def _solve_texel(
 
 
 @numba.njit(cache=True, nogil=True)
+def _solve_bounded(
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    n_values: int,
+    at_probes: Floats,
+    top: Floats,
+    coefficients: Floats,
+    squares: NDArray[np.float64],
+) -> None:
+    """Coefficients of one texel, with as strong a prior as keeps it within its bounds.
+
+    The stronger prior moves first what the samples say least of. It goes no further than their
+    errors allow: a texel that they show to be unlike its cluster remains so.
+    """
+    before = squares.copy()
+    _solve_texel(normal, right, precision, n_values, coefficients, squares)
+    noise = max(squares[0] / max(squares[1], 1e-30), np.trace(precision) / len(right))
+    most = squares[0] + ALLOWED_DEVIATION**2 * len(right) * noise
+    step = 0
+    while step < STRENGTHENINGS and exceeds(at_probes, coefficients, top):
+        step += 1
+        stronger = precision * STRENGTHENING**step
+        weaker, rest = coefficients.copy(), before.copy()
+        _solve_texel(normal, right, stronger, n_values, coefficients, rest)
+        if rest[0] > most:
+            coefficients[:] = weaker
+            return
+        squares[:] = rest
+
+
+@numba.njit(cache=True, nogil=True)
 def _count_values(weights: Floats, channels: Channels) -> int:
     """Number of values that were measured, of samples with weight."""
     count = 0
@@ -267,6 +306,7 @@ def _solve_coefficients(
     cluster: Ints,
     table: Floats,
     precision: NDArray[np.float64],
+    at_probes: Floats,
     coefficients: Floats,
     squares: NDArray[np.float64],
 ) -> None:
@@ -279,10 +319,12 @@ def _solve_coefficients(
         normal = np.zeros((n_components, n_components))
         right = np.zeros(n_components)
         n_values = 0
+        top = np.zeros(3, np.float32)
         for i in np.flatnonzero(view_weights[t]):
             weights = view_weights[t, i] * light_weights[t] * pairs[i]
             measured = channels[t, i] if len(channels) else every
             n_values += _count_values(weights, measured)
+            raise_top(values[t, i], weights, measured, top)
             taps = (view_nodes[t, i], view_taps[t, i])
             _at_view(table[cluster[t]], *taps, touched, plane)
             _add_normal_equations(
@@ -297,8 +339,10 @@ def _solve_coefficients(
                 squares[t],
             )
         if squares[t, 1] > 0 and n_components > 0:
-            _solve_texel(
-                normal, right, precision[cluster[t]], n_values, coefficients[t], squares[t]
+            c = cluster[t]
+            _solve_bounded(
+                *(normal, right, precision[c], n_values, at_probes[c], top),
+                *(coefficients[t], squares[t]),
             )
 
 
@@ -502,7 +546,12 @@ def roughness(table: Floats) -> Floats:
 
 
 def solve_coefficients(
-    rooted: RootedSamples, cluster: Ints, model: ClusteredModel, pool: ThreadPoolExecutor
+    rooted: RootedSamples,
+    cluster: Ints,
+    model: ClusteredModel,
+    pool: ThreadPoolExecutor,
+    *,
+    bounded: bool = False,
 ) -> tuple[Floats, NDArray[np.float64]]:
     """Coefficients of texels for a fixed basis.
 
@@ -514,6 +563,9 @@ def solve_coefficients(
     model : ClusteredModel
         Its `table` and `precision` are used.
     pool : ThreadPoolExecutor
+    bounded : bool
+        Whether a texel may be nowhere brighter than its samples and, by a factor, than the
+        mean of its cluster: where it was not observed its coefficients may say anything.
 
     Returns
     -------
@@ -526,6 +578,7 @@ def solve_coefficients(
     n_components = model.precision.shape[1]
     coefficients = np.zeros((len(cluster), n_components), np.float32)
     squares = np.zeros((len(cluster), 2))
+    at_probes = probes(model.table)[:, : None if bounded else 0]
 
     def solve(part: slice) -> None:
         _solve_coefficients(
@@ -533,6 +586,7 @@ def solve_coefficients(
             cluster[part],
             model.table,
             model.precision,
+            at_probes,
             coefficients[part],
             squares[part],
         )
@@ -633,7 +687,9 @@ def fit_samples(
     blocks = [observed[i : i + step] for i in range(0, len(observed), step)]
     with ThreadPoolExecutor(workers) as pool:
         for block in track(blocks, len(blocks), "coefficients of all texels"):
-            found, _ = solve_coefficients(read(block), model.cluster[block], model, pool)
+            found, _ = solve_coefficients(
+                read(block), model.cluster[block], model, pool, bounded=True
+            )
             coefficients[block] = found
     return replace(model, coefficients=coefficients)
 

@@ -240,6 +240,10 @@ def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]
     """Coefficients of some texels in the basis of the model."""
     with ThreadPoolExecutor(1) as pool:
         found, _ = solve_coefficients(
-            context.reader.rooted(texels), context.model.cluster[texels], context.model, pool
+            context.reader.rooted(texels),
+            context.model.cluster[texels],
+            context.model,
+            pool,
+            bounded=True,
         )
     return {"coefficients": found}

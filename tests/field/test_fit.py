@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError
+from reflfield.field.bounds import MOST_OF_MEAN
 from reflfield.field.fit import (
     ClusteredModel,
     SampleFitOptions,
@@ -489,10 +490,13 @@ class TestFit:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rounds": 0}, "rounds: expected at least 1, received 0"),
+        ({"rounds": 0}, "rounds: expected at least 1 and at most 1000, received 0"),
         ({"iterations": 0}, "iterations: expected at least 1"),
-        ({"fineness": 0.5}, "fineness: expected at least 1, received 0.5"),
-        ({"fineness": float("nan")}, "fineness: expected at least 1, received nan"),
+        ({"fineness": 0.5}, "fineness: expected at least 1 and at most 16, received 0.5"),
+        (
+            {"fineness": float("nan")},
+            "fineness: expected at least 1 and at most 16, received nan",
+        ),
         ({"smoothness": -1.0}, "smoothness: expected 0 to"),
         ({"smoothness": float("nan")}, "smoothness: expected 0 to"),
     ],
@@ -520,3 +524,61 @@ def test_fit_from_a_grid_does_not_depend_on_the_unit(rng, scale):
         for start, s in ((grid, samples), (scaled, in_unit))
     ]
     np.testing.assert_array_equal(found[1].table, np.float32(scale) * found[0].table)
+
+
+def bounded_case(rng, spread):
+    """Texels of one matt cluster, seen and lit from the upper left, with errors of `spread`."""
+    n, side, n_directions = 40, 5, 6
+    flat = HemisphereGrid(side).directions
+    table = np.ones((1, side**2, side**2, 2, 3), np.float32)
+    # The component is faint where texels are seen and lit, and strong elsewhere.
+    elsewhere = (flat[:, 0] > 0.1)[:, None] & (flat[:, 0] > 0.1)
+    table[..., 1, :] = np.where(elsewhere, 3.0, 0.05)[..., None]
+    model = replace(
+        planted_model(rng, n, n_clusters=1, n_components=1, nodes=(side**2, side**2)),
+        table=np.ascontiguousarray(table.reshape(1, side**2, side**2, -1)),
+    )
+    towards = rng.normal(size=(2, n * n_directions, 3))
+    towards[..., 0], towards[..., 2] = (
+        -np.abs(towards[..., 0]) - 1,
+        np.abs(towards[..., 2]) + 0.5,
+    )
+    towards /= np.linalg.norm(towards, axis=2, keepdims=True)
+    taps = [
+        tuple(part.reshape(n, n_directions, 4) for part in HemisphereGrid(side).taps(some))
+        for some in towards
+    ]
+    every = np.ones((n, n_directions), np.float32)
+    values = 1 + spread * rng.normal(size=(n, n_directions, n_directions, 3))
+    samples = RootedSamples(
+        values=values.astype(np.float32),
+        view_taps=taps[0],
+        light_taps=taps[1],
+        view_weights=every,
+        light_weights=every,
+        pairs=np.ones((n_directions, n_directions), np.float32),
+    )
+    return samples, model
+
+
+def test_a_texel_is_nowhere_much_brighter_than_seen(rng, pool):
+    samples, model = bounded_case(rng, 0.3)
+    cluster = np.zeros(len(samples.values), np.int32)
+    parts = model.table[0].reshape(-1, 2, 3)
+    top = np.maximum(samples.values.max(axis=(1, 2)), MOST_OF_MEAN)
+    highest = {}
+    for bounded in (False, True):
+        found, _ = solve_coefficients(samples, cluster, model, pool, bounded=bounded)
+        at_nodes = parts[:, 0] + np.einsum("tk,nkc->tnc", found, parts[:, 1:])
+        highest[bounded] = (at_nodes.max(axis=1) - top).max()
+    assert highest[False] > 1.0
+    assert highest[True] < 1e-5  # rounding in float32
+
+
+def test_texels_within_their_bounds_are_as_without(rng, pool):
+    samples, model = bounded_case(rng, 0.0)
+    cluster = np.zeros(len(samples.values), np.int32)
+    free, free_squares = solve_coefficients(samples, cluster, model, pool)
+    held, held_squares = solve_coefficients(samples, cluster, model, pool, bounded=True)
+    assert np.array_equal(free, held)
+    assert np.array_equal(free_squares, held_squares)
