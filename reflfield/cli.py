@@ -174,7 +174,13 @@ def say_error(line: str) -> None:
 
 def say(line: str) -> None:
     """One line of result on standard output, with what cannot be printed escaped."""
-    print(printable(line), flush=True)
+    try:
+        print(printable(line), flush=True)
+    except BrokenPipeError:  # the reader has what it wanted
+        raise
+    except OSError as error:
+        error.filename = "standard output"
+        raise
 
 
 @app.callback(invoke_without_command=True)

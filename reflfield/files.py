@@ -64,6 +64,31 @@ def check_regular(path: Path, error: type[InputError] = InputError) -> int:
     return found.st_size
 
 
+def utf8_name(path: Path, error: type[InputError] = InputError) -> str:
+    r"""Name of a file for libraries that read and write by names in UTF-8.
+
+    Where the locale has another encoding, Python holds the bytes of a name as halves of
+    surrogate pairs.
+
+    Raises
+    ------
+    InputError
+        Of the type asked for, if the bytes of the name are no UTF-8.
+
+    Examples
+    --------
+    >>> utf8_name(Path("vas\udcc3\udca9.exr"))
+    'vas\xe9.exr'
+    """
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeError:
+        raise error(
+            f"{path}: expected a name in UTF-8, received one in another encoding; rename the "
+            "file or the folders above it"
+        ) from None
+
+
 def read_bytes(path: Path, most_bytes: int, error: type[InputError] = InputError) -> bytes:
     """Bytes of a regular file of a bounded size.
 

@@ -27,6 +27,7 @@ from reflfield.capture.image_headers import READABLE, ImageHeader, check_png, ch
 from reflfield.capture.image_layers import Layer
 from reflfield.capture.stated_color import radiance_scale, stated_space
 from reflfield.errors import CaptureError
+from reflfield.files import utf8_name
 
 Float32 = NDArray[np.float32]
 
@@ -165,7 +166,7 @@ def _opened(path: Path, header: ImageHeader, layer: Layer) -> Iterator[Any]:
     config = oiio.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1  # as stored: never multiplied on reading
     with _exr_reader(header, layer):
-        file = oiio.ImageInput.open(str(path), config)
+        file = oiio.ImageInput.open(utf8_name(path, CaptureError), config)
     if file is None:
         raise _damaged(path, _error_of(oiio))
     try:
@@ -377,7 +378,7 @@ def _raw(path: Path, header: ImageHeader) -> Iterator[Any]:
             f"{RAW_HINT}"
         )
     try:
-        with rawpy.imread(str(path)) as raw:
+        with rawpy.imread(utf8_name(path, CaptureError)) as raw:
             yield raw
     except rawpy.LibRawError as error:
         raise CaptureError(

@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.files import replacing
+from reflfield.files import replacing, utf8_name
 
 
 def write_exr(
@@ -62,7 +62,7 @@ def _write(path: Path, partial: Path, spec: Any, pixels: NDArray[Any]) -> None:
     partial.touch()  # where that is impossible, it says why
     file: Any = oiio.ImageOutput.create("openexr")
     try:
-        written = file.open(str(partial), spec, "Create") and file.write_image(pixels)
+        written = file.open(utf8_name(partial), spec, "Create") and file.write_image(pixels)
     finally:
         closed = file.close()
     error = file.geterror() + oiio.geterror()

@@ -2,6 +2,8 @@
 
 import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -151,3 +153,14 @@ def test_folder_for_results_is_neither_nameless_nor_the_root(
         assert outcome.status == 2
         assert "expected a folder for results, received" in outcome.err
     assert not list(tmp_path.iterdir())
+
+
+def test_output_that_is_full_is_named(tiny_capture):
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        done = subprocess.run(
+            [sys.executable, "-m", "reflfield", "inspect", str(tiny_capture)],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=100,
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert "reflfield: error: standard output: No space left on device" in done.stderr
+    assert "Traceback" not in done.stderr
