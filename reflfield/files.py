@@ -221,6 +221,11 @@ def _array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
+def unfinished_name(path: Path) -> Path:
+    """Name of a file in `replacing`, which a process that was killed may leave."""
+    return path.with_name(f".{path.name}.partial")
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary name that becomes `path` if the block succeeds, else vanishes.
@@ -229,7 +234,7 @@ def replacing(path: Path) -> Iterator[Path]:
     content is on the disk before the name is given: after a power failure `path` holds the
     earlier file or the new one.
     """
-    partial = path.with_name(f".{path.name}.partial")
+    partial = unfinished_name(path)
     with naming(path):
         try:
             yield partial

@@ -19,7 +19,7 @@ from typing import Any
 from reflfield.checksums import agrees
 from reflfield.config import write_toml
 from reflfield.errors import InputError
-from reflfield.files import naming, replacing
+from reflfield.files import naming, replacing, unfinished_name
 from reflfield.stages import StageFolder, plain, read_record, versions
 from reflfield.steps import choices
 from reflfield.steps.job import Job
@@ -55,6 +55,8 @@ def publish(job: Job) -> None:
         for target, source, recorded in _results(job)
         if not agrees(job.out / target, recorded)
     }
+    for target in (target for files in RESULTS.values() for target in files.values()):
+        unfinished_name(job.out / target).unlink(missing_ok=True)  # of a run that was killed
     for target in _outdated(job):
         _move(job.out / target, job.out / OUTDATED / target)
     with naming(job.out), ExitStack() as together:
