@@ -150,6 +150,8 @@ def _damaged_chunk(store: Path, recorded: Mapping[str, int]) -> Path | None:
     """What of a store is damaged: a chunk, or their number or size."""
     chunks = list(_files(store))
     for chunk in chunks:
+        if not chunk.is_file():  # a pipe, or a link to nothing
+            return chunk
         if chunk.stat().st_mtime_ns > recorded["newest"] and not _is_whole(chunk):
             return chunk
     sizes = [chunk.stat().st_size for chunk in chunks]

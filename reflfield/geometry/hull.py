@@ -44,7 +44,7 @@ _MOST_VIEWS = 100_000
 # Blur takes memory, smoothing time; the smallest component is a share of the largest.
 _RANGES = {
     "blur": (0, 100),
-    "smoothing": (0, 10_000),
+    "smoothing": (0, 1000),
     "n_triangles": (0, 10_000_000),
     "minimum_component": (0, 1),
 }

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from reflfield.capture.image_writing import write_exr
+from reflfield.checksums import checksums, first_damaged
 from reflfield.config import parse_settings, read_toml, with_tables
 from reflfield.errors import InputError
 from reflfield.folders import LOCK, only_run
@@ -164,3 +165,15 @@ def test_output_that_is_full_is_named(tiny_capture):
     assert done.returncode == 2
     assert "reflfield: error: standard output: No space left on device" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_chunk_of_samples_that_is_a_pipe_is_damaged(tmp_path):
+    (tmp_path / "samples" / "c").mkdir(parents=True)
+    chunk = tmp_path / "samples" / "c" / "0"
+    chunk.write_bytes(b"12345678")
+    recorded = checksums(tmp_path, stores=("samples",))
+    assert first_damaged(tmp_path, recorded) is None
+    for make in (os.mkfifo, lambda p: p.symlink_to("nowhere")):
+        chunk.unlink()
+        make(chunk)
+        assert first_damaged(tmp_path, recorded) == "samples/c/0"
