@@ -129,8 +129,8 @@ def check_photographs(capture: Capture) -> None:
         for exposure in photograph.exposures:
             size = image_size(exposure.path, exposure.reading)
             check_matches(exposure.path, camera, *size)
-    _check_files_once(capture)
     _check_orientations(capture)
+    _check_files_once(capture)
     for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
         if path is not None:
             check_matches(path, camera, *image_size(path))

@@ -158,9 +158,10 @@ def largest_code_of_16(path: Path | str, reading: ImageReading = AS_STATED) -> i
     int or None
         None for other files, and for linear ones, which are right up to a scale.
     """
-    if reading.encoding is not None:
+    path = Path(path)
+    if reading.encoding is not None or read_header(path).kind not in ("png", "tiff"):
         return None
-    stored = _read(Path(path), reading)
+    stored = _read(path, reading)
     if stored.colour.dtype != np.uint16 or stored.stated().encoding.name == LINEAR:
         return None
     return int(stored.colour.max(initial=0))

@@ -237,7 +237,7 @@ class TestOrientation:
     def test_mixture_of_one_camera_is_refused(self, tmp_path, orientations):
         for i, orientation in enumerate(orientations):
             self.photograph(tmp_path, f"{i}.jpg", orientation)
-        (tmp_path / "x.lp").write_text("3\n0.jpg 0 0 1\n1.jpg 0 1 0\n2.jpg 1 0 0\n")
+        (tmp_path / "x.lp").write_text("3\n0.jpg 0 0 1\n1.jpg 0 1 1\n2.jpg 1 0 1\n")
         with pytest.raises(CaptureError, match=r"\.jpg: expected Exif orientation"):
             open_capture(tmp_path)
 
@@ -245,6 +245,6 @@ class TestOrientation:
     def test_one_orientation_stays_as_stored(self, tmp_path, orientation):
         for i in range(2):
             self.photograph(tmp_path, f"{i}.jpg", orientation)
-        (tmp_path / "x.lp").write_text("2\n0.jpg 0 0 1\n1.jpg 0 1 0\n")
+        (tmp_path / "x.lp").write_text("2\n0.jpg 0 0 1\n1.jpg 0 1 1\n")
         capture = open_capture(tmp_path)
         assert capture.read_photograph(0).shape == (6, 8, 3)
