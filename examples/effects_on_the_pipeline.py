@@ -37,7 +37,7 @@ from capture_sim.model import Scene
 from capture_sim.scene import load_scene
 from capture_sim.write import write_capture
 from reflfield.capture.readers import open_capture
-from reflfield.comparison.truth import open_truth
+from reflfield.comparison.truth_files import open_truth
 from reflfield.config import Resources, read_toml, with_tables
 from reflfield.field.file import open_field
 from reflfield.pipeline import run

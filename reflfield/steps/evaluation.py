@@ -14,24 +14,17 @@ from scipy.spatial import cKDTree
 
 from reflfield.capture.model import Capture
 from reflfield.capture.readers import open_capture
+from reflfield.comparison.completion_error import CompletionError, completion_error
 from reflfield.comparison.coverage import (
     FrameSilhouettes,
     open_frame_silhouettes,
     write_frame_silhouettes,
 )
+from reflfield.comparison.frame_errors import FrameErrors, frame_errors, surface_points
 from reflfield.comparison.heldout import RelitPairs, compare_with_photographs
+from reflfield.comparison.hull_distance import HullDistance, hull_distance
 from reflfield.comparison.metrics import Comparison, NothingToMeasure, metrics_text
-from reflfield.comparison.truth import (
-    CompletionError,
-    FrameErrors,
-    HullDistance,
-    Truth,
-    completion_error,
-    frame_errors,
-    hull_distance,
-    open_truth,
-    surface_points,
-)
+from reflfield.comparison.truth_files import Truth, open_truth
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.field.model import ReflectanceField

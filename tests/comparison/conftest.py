@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.comparison import sections
+from reflfield.comparison.completion_error import CompletionError
+from reflfield.comparison.frame_errors import FrameErrors
+from reflfield.comparison.hull_distance import HullDistance
 from reflfield.comparison.metrics import FramePair, compare_frames
 from reflfield.comparison.report import ReportContent
-from reflfield.comparison.truth import CompletionError, FrameErrors, HullDistance
 
 
 def disk(size, radius):

@@ -10,16 +10,15 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from reflfield.capture.readers import open_capture
-from reflfield.comparison.truth import (
+from reflfield.comparison.completion_error import completion_error
+from reflfield.comparison.frame_errors import (
     SurfacePoints,
-    TruthView,
     angle_deg,
-    completion_error,
     frame_errors,
-    hull_distance,
-    open_truth,
     surface_points,
 )
+from reflfield.comparison.hull_distance import hull_distance
+from reflfield.comparison.truth_files import TruthView, open_truth
 from reflfield.errors import CaptureError, InputError, ShapeError
 
 

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from reflfield.comparison import plots
+from reflfield.comparison.completion_error import CompletionError
+from reflfield.comparison.frame_errors import FrameErrors
+from reflfield.comparison.hull_distance import HullDistance
 from reflfield.comparison.metrics import (
     Comparison,
 )
@@ -19,7 +22,6 @@ from reflfield.comparison.report import (
     Table,
 )
 from reflfield.comparison.sections.frames import comparisons_table
-from reflfield.comparison.truth import CompletionError, FrameErrors, HullDistance
 
 
 def truth_section(
