@@ -20,7 +20,7 @@ PSNR_CAP_DB = 100.0
 # skimage's default window; smaller only for pictures that it does not fit into.
 SSIM_WINDOW_PX = 7
 # Pixels of a picture that are looked at together; a measure takes 500 bytes of each.
-PIXELS_AT_ONCE = 1 << 20
+PIXELS_AT_ONCE = 1 << 19
 # Rows beside a strip that its measures look at: FLIP's filters reach 10 pixels.
 HALO_PX = 32
 

@@ -6,10 +6,16 @@ from dataclasses import replace
 
 from reflfield.capture.image_files import image_size
 from reflfield.capture.model import Capture
+from reflfield.comparison.image_errors import PIXELS_AT_ONCE
 from reflfield.config import Resources, gigabytes
 from reflfield.errors import InputError
 from reflfield.field.model import ReflectanceField
-from reflfield.observations.store import SAMPLE_BYTES, chunk_shape
+from reflfield.observations.store import (
+    SAMPLE_BYTES,
+    VIEWS_PER_CHUNK,
+    WRITER_BYTES,
+    chunk_shape,
+)
 from reflfield.relighting.renderer import RenderOptions
 from reflfield.steps.columns import COLUMNS_AT_ONCE
 from reflfield.steps.job import Job
@@ -19,6 +25,11 @@ BASE_BYTES = 512 << 20
 # A pixel of a photograph while it is read: as stored, as float32, what of it was measured, and
 # the copy that is sampled or shown.
 PHOTOGRAPH_BYTES = 48
+# A pixel of a held-out photograph while it is compared and shown in the report; and of the
+# strip that is measured, besides.
+HELD_OUT_BYTES, STRIP_BYTES = 46, 500
+# What compiling the kernels of a first run leaves in memory, before frames are compared.
+COMPILED_BYTES = 400 << 20
 # A pixel of a silhouette while it is made from photographs.
 SILHOUETTE_BYTES = 80
 # A pixel of the signed distance to an outline.
@@ -36,22 +47,39 @@ LARGEST_USE = 0.8
 def least_memory(job: Job) -> int:
     """Bytes that the run holds at the same time however small its blocks are.
 
-    Of every view which of its pixels are covered, with what is made of the largest image; or
-    what is kept of every texel with the samples of one view under all lights, whichever is
-    more; and one block of each thread, or the columns of one, whichever is more.
+    Of every view which of its pixels are covered, what is made of the largest image, and the
+    samples that are written together; or what is kept of every texel with the samples of one
+    view under all lights, and one block of each thread or the columns of one: whichever is
+    more.
     """
     training = job.training
     pixels = [camera.width * camera.height for camera in training.cameras]
     held = [camera.width * camera.height for camera in job.held_frames.cameras]
     made = any(path is None for path in training.silhouettes)
-    largest = max(max(PHOTOGRAPH_BYTES, SILHOUETTE_BYTES * made) * max(pixels),
-                  COMPARED_BYTES * max(held, default=0))  # fmt: skip
-    views = sum(pixels) // 8 + largest
+    largest = max(
+        max(PHOTOGRAPH_BYTES, SILHOUETTE_BYTES * made) * max(pixels),
+        compared_bytes(max(held, default=0)),
+    )
+    texels, n_lights = most_texels(job), training.n_lights
+    samples = min(WRITER_BYTES, VIEWS_PER_CHUNK * texels * n_lights * SAMPLE_BYTES)
+    images = sum(pixels) // 8 + largest + texels * TEXEL_BYTES + WRITER_COPIES * samples
     rank = max(job.options.completion.rank, job.options.compression.rank)
     each = TEXEL_BYTES + training.n_views + 7 * training.n_lights + 12 * rank
     blocks = job.resources.workers * job.resources.block_bytes
     columns = columns_bytes(job.sides[0] ** 2 * job.sides[1] ** 2)
-    return BASE_BYTES + max(views, most_texels(job) * each) + max(blocks, columns)
+    return BASE_BYTES + max(images, texels * each + max(blocks, columns))
+
+
+def compared_bytes(pixels: int) -> int:
+    """Memory of a held-out photograph while it is compared, with the kernels compiled by then.
+
+    Examples
+    --------
+    >>> compared_bytes(0)
+    0
+    """
+    strip = STRIP_BYTES * min(pixels, PIXELS_AT_ONCE)
+    return HELD_OUT_BYTES * pixels + strip + COMPILED_BYTES if pixels else 0
 
 
 def keeps_distances(job: Job) -> bool:
