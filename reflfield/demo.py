@@ -50,7 +50,7 @@ COMPILE = """
 import numpy as np
 from reflfield.alignment import align
 from reflfield.field.fit import ClusteredModel, SampleFitOptions, fit_samples
-from reflfield.observations.resampling import TexelSamples, rooted_samples
+from reflfield.observations.texel_samples import TexelSamples, rooted_samples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 directions = HemisphereGrid(7).directions

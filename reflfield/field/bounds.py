@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.observations.resampling import Channels
+from reflfield.observations.texel_samples import Channels
 
 Floats = NDArray[np.float32]
 

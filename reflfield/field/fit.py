@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from reflfield.checks import check_ranges
 from reflfield.errors import InputError
 from reflfield.field.bounds import exceeds, probes, raise_top
-from reflfield.observations.resampling import ALL_CHANNELS, Channels, RootedSamples
+from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, RootedSamples
 from reflfield.progress import report, track
 
 Floats = NDArray[np.float32]

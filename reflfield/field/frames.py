@@ -22,7 +22,7 @@ from reflfield.alignment.splines import FAST
 from reflfield.checks import check_shape
 from reflfield.field.fit import ClusteredModel
 from reflfield.observations.reading import TexelReader
-from reflfield.observations.resampling import POWERS, root
+from reflfield.observations.texel_samples import POWERS, root
 from reflfield.progress import track
 from reflfield.sphere.hemisphere import place_directions, softened_cosine_of
 

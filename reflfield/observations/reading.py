@@ -9,20 +9,17 @@ from numpy.typing import NDArray
 
 from reflfield.capture.model import Capture
 from reflfield.observations.projection import directions_of, facing_irradiance
-from reflfield.observations.resampling import (
+from reflfield.observations.resampling import Nodes, ResamplingOptions, resample, side_for
+from reflfield.observations.store import Bools, ObservationStore, Observed
+from reflfield.observations.texel_samples import (
     POWERS,
-    Nodes,
-    ResamplingOptions,
     RootedSamples,
     TexelSamples,
     above_horizon,
     local_directions,
-    resample,
     root,
     rooted_samples,
-    side_for,
 )
-from reflfield.observations.store import Bools, ObservationStore, Observed
 from reflfield.sphere.hemisphere import softened_cosine
 
 Floats = NDArray[np.float32]

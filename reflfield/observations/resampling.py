@@ -16,26 +16,27 @@ A node counts as observed as far as directions actually seen lie near it
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
-from reflfield.sphere.hemisphere import HORIZON_SOFTNESS, HemisphereGrid, softened_cosine
+from reflfield.observations.texel_samples import (
+    ALL_CHANNELS,
+    POWERS,
+    Channels,
+    RootedSamples,
+    interpolation_matrices,
+)
 
 Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Indices = NDArray[np.intp]
-Bools = NDArray[np.bool_]
-Channels = NDArray[np.uint8]
-Directions = TypeVar("Directions", NDArray[np.float32], NDArray[np.float64])
-
-POWERS = {"cube_root": 3.0, "square_root": 2.0, "linear": 1.0}
 
 # A node with less than this summed interpolation weight was not observed.
 LEAST_SUPPORT = 0.1
@@ -43,8 +44,6 @@ LEAST_SUPPORT = 0.1
 CONTINUED = 0.05
 # Sweeps that fill pairs never photographed before the separable solve.
 FILLING_SWEEPS = 4
-# A view this far below a texel's frame (sine of 12 degrees) tells of another surface.
-LOWEST_VIEW = -0.2
 
 
 @dataclass(frozen=True)
@@ -105,36 +104,6 @@ def side_for(n_directions: int) -> int:
     return int(np.clip(int(1.2 * np.sqrt(n_directions)) | 1, 5, 13))
 
 
-def root(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
-    """Samples into the domain of the factorization; the sign is kept.
-
-    Examples
-    --------
-    >>> root(np.array([8.0, -8.0]), "cube_root"), root(np.array([9.0, -9.0]), "square_root")
-    (array([ 2., -2.]), array([ 3., -3.]))
-    """
-    if domain == "linear":
-        return values
-    if domain == "cube_root":
-        return np.cbrt(values)
-    return np.sign(values) * np.sqrt(np.abs(values))
-
-
-def unroot(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
-    """Inverse of `root`.
-
-    Examples
-    --------
-    >>> unroot(np.array([2.0, -2.0]), "cube_root"), unroot(np.array([-3.0]), "square_root")
-    (array([ 8., -8.]), array([-9.]))
-    """
-    if domain == "linear":
-        return values
-    if domain == "cube_root":
-        return values**3
-    return values * np.abs(values)
-
-
 @lru_cache(maxsize=16)
 def prior_covariance(side: int, smoothness: float) -> NDArray[np.float64]:
     """Covariance (n_nodes, n_nodes) of a smooth function on a hemisphere grid.
@@ -193,192 +162,6 @@ class Nodes:
         if self.pair_support.ndim == 4:
             product = product[..., None]
         return np.minimum(product, self.pair_support)
-
-
-@dataclass(frozen=True, eq=False)
-class TexelSamples:
-    """Samples of some texels with their directions, as the resampling takes them.
-
-    Parameters
-    ----------
-    samples : (n, n_views, n_lights, 3) float
-        Radiance over facing irradiance, over `unit`.
-    views, lights : (n, n_directions, 3) float32
-        Unit directions in the world frame.
-    view_seen, light_seen : (n, n_directions) bool
-        Which count.
-    pairs : (n_views, n_lights) bool
-        Which were photographed.
-    unit : float
-        What the samples are in, 1/sr.
-    has_gaps : bool
-        Whether values of samples that count may be NaN: not measured.
-    """
-
-    samples: NDArray[np.floating]
-    views: Floats
-    lights: Floats
-    view_seen: Bools
-    light_seen: Bools
-    pairs: Bools
-    unit: float = 1.0
-    has_gaps: bool = True
-
-    @property
-    def seen(self) -> Bools:
-        """(n, n_views, n_lights) True where the texel is seen, lit and photographed."""
-        return self.view_seen[:, :, None] & self.light_seen[:, None] & self.pairs
-
-
-def local_directions(local_from_world: Directions, directions: Directions) -> Directions:
-    """Directions (n, k, 3) of the world in the texels' frames (n, 3, 3), in their precision.
-
-    Examples
-    --------
-    A frame whose normal is +x of the world:
-
-    >>> frame = np.array([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]], np.float32)
-    >>> local_directions(frame, np.array([[[1, 0, 0]]], np.float32))
-    array([[[0., 0., 1.]]], dtype=float32)
-    """
-    return directions @ np.swapaxes(local_from_world, 1, 2)
-
-
-# Bits of `RootedSamples.channels`, and all of them.
-CHANNEL_BITS = np.array([1, 2, 4], np.uint8)
-ALL_CHANNELS = 7
-
-
-def all_channels() -> Channels:
-    """What stands for texels of which every channel was measured."""
-    return np.zeros((0, 0, 0), np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class RootedSamples:
-    """Samples in the domain with interpolation taps and weights in the texels' frames.
-
-    Parameters
-    ----------
-    values : (n, n_views, n_lights, 3) float32
-        Samples over softened cosine, in the domain; zero where they do not count.
-    view_taps, light_taps : tuple of ((n, k, 4) int32, (n, k, 4) float32)
-        Nodes and weights.
-    view_weights, light_weights : (n, k) float32
-        What a sample weighs is the product of the two and of its pair.
-    pairs : (n_views, n_lights) float32
-        1 where photographed.
-    channels : (n, n_views, n_lights) uint8, optional
-        Bit c is set where channel c was measured; without texels: all, as in most captures.
-    """
-
-    values: Floats
-    view_taps: tuple[NDArray[np.int32], Floats]
-    light_taps: tuple[NDArray[np.int32], Floats]
-    view_weights: Floats
-    light_weights: Floats
-    pairs: Floats
-    channels: Channels = field(default_factory=all_channels)
-
-    @property
-    def has_gaps(self) -> bool:
-        """Whether some channel was not measured."""
-        return len(self.channels) > 0
-
-    def measured(self) -> Bools:
-        """(n, n_views, n_lights, 3) which channels were measured."""
-        if not self.has_gaps:
-            return np.ones(self.values.shape, np.bool_)
-        return (self.channels[..., None] & CHANNEL_BITS) > 0
-
-
-def rooted_samples(
-    texels: TexelSamples, local_from_world: Floats, sides: tuple[int, int], domain: str
-) -> RootedSamples:
-    """Bring samples into the domain and find their taps in the texels' frames.
-
-    A sample y = s D^-1(u) with cosine s; an error of D^-1(u) counts s times, so in the
-    domain with power p the weight of u is ``s ** (2 / p)``.
-
-    Parameters
-    ----------
-    texels : TexelSamples
-    local_from_world : (n, 3, 3) float32
-        Frames to resample in.
-    sides : (int, int)
-        Sides of the view and light grids; 1 for a direction that does not vary.
-    domain : str
-
-    Returns
-    -------
-    RootedSamples
-
-    Notes
-    -----
-    Views below `LOWEST_VIEW` and lights more than half the softened band below the
-    texel's horizon do not count, where the direction varies.
-    """
-    view = local_directions(local_from_world, texels.views)
-    light = local_directions(local_from_world, texels.lights)
-    view_seen, light_seen = above_horizon(
-        texels.view_seen, texels.light_seen, view, light, sides
-    )
-    cosine = np.ones(light.shape[:2], np.float32)
-    if sides[1] > 1:
-        cosine = softened_cosine(light[..., 2]).astype(np.float32)
-    safe = np.where(light_seen, cosine, np.float32(1.0))
-    # A third of the samples count at a dome: only these are brought into the domain.
-    t, i, j = np.nonzero(view_seen[:, :, None] & light_seen[:, None] & texels.pairs)
-    values = np.zeros(texels.samples.shape, np.float32)
-    ratio = texels.samples[t, i, j].astype(np.float32) * np.float32(texels.unit)
-    ratio /= safe[t, j][:, None]
-    channels = all_channels()
-    unmeasured = np.isnan(ratio) if texels.has_gaps else np.zeros(0, np.bool_)
-    if unmeasured.any():
-        channels = np.zeros(values.shape[:3], np.uint8)
-        channels[t, i, j] = ~unmeasured @ CHANNEL_BITS
-        ratio[unmeasured] = 0.0
-    values[t, i, j] = root(ratio, domain)
-    return RootedSamples(
-        values=values,
-        view_taps=direction_taps(view, sides[0]),
-        light_taps=direction_taps(light, sides[1]),
-        view_weights=view_seen.astype(np.float32),
-        light_weights=light_seen * safe ** np.float32(2.0 / POWERS[domain]),
-        pairs=texels.pairs.astype(np.float32),
-        channels=channels,
-    )
-
-
-def above_horizon(
-    view_seen: Bools, light_seen: Bools, view: Floats, light: Floats, sides: tuple[int, int]
-) -> tuple[Bools, Bools]:
-    """Which seen views and lights count in the texels' frames; see `rooted_samples`.
-
-    Parameters
-    ----------
-    view_seen, light_seen : (n, k) bool
-    view, light : (n, k, 3) float
-        Directions in the texels' frames.
-    sides : (int, int)
-        1 for a direction that does not vary.
-
-    Returns
-    -------
-    view_counts, light_counts : (n, k) bool
-    """
-    if sides[0] > 1:
-        view_seen = view_seen & (view[..., 2] > LOWEST_VIEW)
-    if sides[1] > 1:
-        light_seen = light_seen & (light[..., 2] > -0.5 * HORIZON_SOFTNESS)
-    return view_seen, light_seen
-
-
-def direction_taps(directions: Floats, side: int) -> tuple[NDArray[np.int32], Floats]:
-    """Nodes and weights (n, k, 4) that interpolate at local directions (n, k, 3)."""
-    nodes, weights = HemisphereGrid(side).taps(directions.reshape(-1, 3))
-    shape = (*directions.shape[:2], 4)
-    return nodes.reshape(shape), weights.reshape(shape)
 
 
 def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -> Nodes:
@@ -695,23 +478,3 @@ def apply_both(left: Floats, right: Floats, values: Floats) -> Floats:
     # (n, nodes, b, c) -> contract b by batched GEMM with channels folded into rows.
     folded = np.swapaxes(halfway, 2, 3).reshape(n, -1, b) @ np.swapaxes(right, 1, 2)
     return np.swapaxes(folded.reshape(n, halfway.shape[1], c, -1), 2, 3)
-
-
-def interpolation_matrices(taps: tuple[NDArray[np.int32], Floats], side: int) -> Floats:
-    """Dense interpolation matrices (n, k, n_nodes) of taps (n, k, 4).
-
-    Examples
-    --------
-    >>> zenith = np.array([[[0, 0, 1]]], np.float32)
-    >>> interpolation_matrices(direction_taps(zenith, 3), 3).reshape(3, 3)
-    array([[0., 0., 0.],
-           [0., 1., 0.],
-           [0., 0., 0.]], dtype=float32)
-    """
-    nodes, weights = taps
-    n, k, _ = nodes.shape
-    dense = np.zeros((n * k, side * side), np.float32)
-    row = np.arange(n * k)
-    for tap in range(4 if side > 1 else 1):
-        dense[row, nodes[..., tap].ravel()] += weights[..., tap].ravel()
-    return dense.reshape(n, k, side * side)

@@ -28,8 +28,8 @@ from reflfield.comparison.truth_files import Truth, open_truth
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.field.model import ReflectanceField
-from reflfield.observations.resampling import (
-    apply_both,
+from reflfield.observations.resampling import apply_both
+from reflfield.observations.texel_samples import (
     direction_taps,
     interpolation_matrices,
     local_directions,

@@ -39,8 +39,8 @@ from reflfield.observations.projection import (
     project_photographs,
 )
 from reflfield.observations.reading import LUMINANCE, TexelReader
-from reflfield.observations.resampling import unroot
 from reflfield.observations.store import open_samples
+from reflfield.observations.texel_samples import unroot
 from reflfield.scheduling import Blocks
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.sphere.projection import safe_band_limit

@@ -19,7 +19,7 @@ from reflfield.field.fit import (
     roughness,
     solve_coefficients,
 )
-from reflfield.observations.resampling import CHANNEL_BITS, RootedSamples, all_channels
+from reflfield.observations.texel_samples import CHANNEL_BITS, RootedSamples, all_channels
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 SIDES = (3, 3)

@@ -9,7 +9,7 @@ import numpy as np
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.lights import Light
 from reflfield.capture.model import Capture, Photograph
-from reflfield.observations.resampling import RootedSamples, TexelSamples
+from reflfield.observations.texel_samples import RootedSamples, TexelSamples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 

@@ -9,15 +9,9 @@ from reflfield.capture.lights import Light
 from reflfield.observations import resampling
 from reflfield.observations.projection import directions_of, pairs_photographed
 from reflfield.observations.reading import LUMINANCE, NodeColumns, TexelReader, luminance_of
-from reflfield.observations.resampling import (
-    CHANNEL_BITS,
-    CONTINUED,
-    ResamplingOptions,
-    local_directions,
-    resample,
-    rooted_samples,
-)
+from reflfield.observations.resampling import CONTINUED, ResamplingOptions, resample
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
+from reflfield.observations.texel_samples import CHANNEL_BITS, local_directions, rooted_samples
 from reflfield.sphere.hemisphere import softened_cosine
 
 from .rigs import dome, hemisphere, rooted, texel_samples, tilted_frames

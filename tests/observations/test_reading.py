@@ -6,8 +6,9 @@ import pytest
 from reflfield.capture.lights import Light
 from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import NodeColumns, TexelReader, grid_sides
-from reflfield.observations.resampling import ResamplingOptions, root
+from reflfield.observations.resampling import ResamplingOptions
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
+from reflfield.observations.texel_samples import root
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 from .rigs import dome, tilted_frames

@@ -10,19 +10,21 @@ from hypothesis import strategies as st
 from reflfield.errors import InputError
 from reflfield.observations import resampling
 from reflfield.observations.resampling import (
+    ResamplingOptions,
+    apply_both,
+    prior_covariance,
+    resample,
+    side_for,
+)
+from reflfield.observations.texel_samples import (
     LOWEST_VIEW,
     POWERS,
-    ResamplingOptions,
     RootedSamples,
-    apply_both,
     direction_taps,
     interpolation_matrices,
     local_directions,
-    prior_covariance,
-    resample,
     root,
     rooted_samples,
-    side_for,
     unroot,
 )
 from reflfield.sphere.hemisphere import HORIZON_SOFTNESS, HemisphereGrid
@@ -515,7 +517,7 @@ class TestOptions:
             ({"view_side": -1}, "view_side: expected 0 to 64, received -1"),
             ({"light_side": 65}, "light_side: expected 0 to 64, received 65"),
             ({"domain": "log"}, "domain: expected one of"),
-            ({"smoothness": 0.0}, "smoothness: expected > 0, received 0.0"),
+            ({"smoothness": 0.0}, "smoothness: expected > 0, at most 1e6, received 0.0"),
             ({"smoothness": float("nan")}, "smoothness: expected > 0"),
             ({"visibility": "traced"}, "visibility: expected 'factored', 'kept'"),
         ],
