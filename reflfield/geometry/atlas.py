@@ -28,6 +28,9 @@ _METHODS = ("xatlas", "boxes")
 LARGEST_TEXTURE = 1 << 15
 # Seconds beyond a week are a slip, and more than the system can wait for.
 _RANGES = {"padding": (0, 64), "time_limit_s": (0, 1e6), "max_cost": (-1e6, 1e6)}
+# A texture with more padding than this share of its side has no place for charts, and packing
+# looks for one for minutes.
+LEAST_TEXELS_PER_PADDING, LEAST_PADDING = 16, 2
 
 # Triangles that xatlas unwraps in at most a few minutes of one core, however rough they are:
 # 20,000 take 2 to 13 s, 80,000 smooth ones 23 s.
@@ -48,7 +51,7 @@ class AtlasOptions:
         Side of the square texture, texels; about half of them will be used. 0 leaves the
         choice to the pipeline, which looks at the photographs.
     padding : int
-        Empty texels between charts.
+        Empty texels between charts; at most a sixteenth of the texture's side.
     time_limit_s : float
         A guard against a hang: xatlas is stopped after this time, and that is an error. What
         it may take is bounded otherwise (`MOST_FACES`), so that a busy machine makes the same
@@ -76,6 +79,12 @@ class AtlasOptions:
                 f"texels, received {self.resolution}"
             )
         check_ranges(self, _RANGES)
+        most = max(LEAST_PADDING, self.resolution // LEAST_TEXELS_PER_PADDING)
+        if self.resolution and self.padding > most:
+            raise InputError(
+                f"padding: expected at most {most} texels in a texture of {self.resolution} x "
+                f"{self.resolution}, received {self.padding}; lower it, or raise the resolution"
+            )
         if not self.time_limit_s > 0:
             raise InputError(f"time_limit_s: expected > 0, received {self.time_limit_s}")
 

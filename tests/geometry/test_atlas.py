@@ -213,8 +213,14 @@ def test_meshes_with_too_many_triangles_get_box_charts_on_every_machine(monkeypa
 
 
 def test_charts_that_do_not_fit_are_said_not_to():
-    with pytest.raises(UnwrappingError, match=r"charts do not fit into 8 x 8 texels"):
-        atlas_module._xatlas_atlas(torus(), AtlasOptions(resolution=8, padding=4))
+    with pytest.raises(UnwrappingError, match=r"charts do not fit into 4 x 4 texels"):
+        atlas_module._xatlas_atlas(torus(), AtlasOptions(resolution=4, padding=2))
+
+
+@pytest.mark.stability
+def test_padding_that_leaves_no_place_for_charts_is_refused():
+    with pytest.raises(InputError, match=r"padding: expected at most 4 texels .*64 x 64"):
+        AtlasOptions(resolution=64, padding=5)
 
 
 def test_an_atlas_that_cannot_be_is_no_reason_for_box_charts(monkeypatch):
