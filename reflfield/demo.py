@@ -49,7 +49,8 @@ OPTIONS = PipelineOptions(
 COMPILE = """
 import numpy as np
 from reflfield.alignment import align
-from reflfield.field.fit import ClusteredModel, SampleFitOptions, fit_samples
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.fit import SampleFitOptions, fit_samples
 from reflfield.observations.texel_samples import TexelSamples, rooted_samples
 from reflfield.sphere.hemisphere import HemisphereGrid
 

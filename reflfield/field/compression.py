@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 from reflfield.checks import check_ranges
 from reflfield.errors import InputError
 from reflfield.factorization import Completion, LocalPCA
-from reflfield.field.fit import ClusteredModel, SampleFitOptions
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.fit import SampleFitOptions
 
 Floats = NDArray[np.float32]
 

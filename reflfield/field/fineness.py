@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import ShapeError
-from reflfield.field.fit import ClusteredModel
+from reflfield.field.clustered_model import ClusteredModel
 
 # Functions of all clusters on the finer nodes, in float32: a fit holds about fourteen copies.
 MOST_BYTES = 32 << 20

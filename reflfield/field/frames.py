@@ -20,7 +20,7 @@ from reflfield.alignment.climbing import scale as shrink
 from reflfield.alignment.refinement import hold, solve_step, turn_frame
 from reflfield.alignment.splines import FAST
 from reflfield.checks import check_shape
-from reflfield.field.fit import ClusteredModel
+from reflfield.field.clustered_model import ClusteredModel
 from reflfield.observations.reading import TexelReader
 from reflfield.observations.texel_samples import POWERS, root
 from reflfield.progress import track

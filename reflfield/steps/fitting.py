@@ -10,15 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.factorization import Completion
+from reflfield.field.clustered_model import ClusteredModel, of_usual_size
+from reflfield.field.coefficients import solve_coefficients
 from reflfield.field.compression import CompressionOptions, cluster_completed, fill_unobserved
 from reflfield.field.fineness import finer_sides, on_finer_nodes
-from reflfield.field.fit import (
-    ClusteredModel,
-    SampleFitOptions,
-    fit_basis,
-    of_usual_size,
-    solve_coefficients,
-)
+from reflfield.field.fit import SampleFitOptions, fit_basis
 from reflfield.field.frames import improved_block as turned
 from reflfield.observations.reading import TexelReader
 from reflfield.scheduling import Blocks

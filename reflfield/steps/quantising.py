@@ -17,9 +17,9 @@ from reflfield.field.building import (
     build_field,
     quantisation_error,
 )
+from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.compression import CompressionOptions
 from reflfield.field.file import PackedSizes
-from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
 from reflfield.field.observed_sphere import distinct_directions
 from reflfield.field.rate import field_of_quality, field_of_size

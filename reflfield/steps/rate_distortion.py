@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from reflfield.comparison.heldout import compare_with_photographs
 from reflfield.comparison.metrics import NothingToMeasure
 from reflfield.comparison.sections import RatePoint
+from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.file import PackedSizes
-from reflfield.field.fit import ClusteredModel
 from reflfield.field.model import ReflectanceField
 from reflfield.progress import track
 from reflfield.steps.evaluation import (

@@ -24,13 +24,11 @@ from reflfield.comparison.residual import sample_error
 from reflfield.config import Resources
 from reflfield.errors import InputError
 from reflfield.factorization import Completion, complete
+from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.compression import (
     CompressionOptions,
 )
 from reflfield.field.file import open_field, write_field
-from reflfield.field.fit import (
-    ClusteredModel,
-)
 from reflfield.observations.light_agreement import looks_at, other_light_axes
 from reflfield.observations.projection import (
     VALUE_KINDS,

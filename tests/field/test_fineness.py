@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from reflfield.errors import ShapeError
+from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.fineness import MOST_BYTES, finer_sides, on_finer_nodes
-from reflfield.field.fit import ClusteredModel
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 

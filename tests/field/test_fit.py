@@ -7,18 +7,11 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError
+from reflfield.field.basis import BasisProblem, roughness
 from reflfield.field.bounds import MOST_OF_MEAN
-from reflfield.field.fit import (
-    ClusteredModel,
-    SampleFitOptions,
-    _BasisProblem,
-    fit_basis,
-    fit_samples,
-    normalised,
-    of_usual_size,
-    roughness,
-    solve_coefficients,
-)
+from reflfield.field.clustered_model import ClusteredModel, normalised, of_usual_size
+from reflfield.field.coefficients import solve_coefficients
+from reflfield.field.fit import SampleFitOptions, fit_basis, fit_samples
 from reflfield.observations.texel_samples import CHANNEL_BITS, RootedSamples, all_channels
 from reflfield.sphere.hemisphere import HemisphereGrid
 
@@ -122,7 +115,7 @@ def part(samples, texels):
 
 
 def problem_of(samples, model, pool, smoothness=0.0):
-    return _BasisProblem(samples, model.cluster, model.coefficients, smoothness, pool)
+    return BasisProblem(samples, model.cluster, model.coefficients, smoothness, pool)
 
 
 class TestModel:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.errors import ShapeError
-from reflfield.field.fit import ClusteredModel
+from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.frames import _add_texel, _gains, _own_function, improved_frames
 from reflfield.observations.projection import pairs_photographed
 from reflfield.observations.reading import TexelReader

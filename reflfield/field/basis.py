@@ -1,0 +1,220 @@
+"""Mean and basis of every cluster for fixed coefficients, by conjugate gradients.
+
+The normal equations of all samples are regularised by the roughness of the functions over
+neighbouring nodes.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.field.sample_sums import (
+    arguments,
+    at_light,
+    at_view,
+    clear,
+    parts,
+    touched_nodes,
+)
+from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, RootedSamples
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+# Squares of this size stand for zero; far below what any unit of the data gives.
+LEAST_ENERGY = 1e-200
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _spread(plane: Floats, nodes: Ints, weights: Floats, values: Floats) -> None:
+    for tap in range(4):
+        weight = weights[tap]
+        for k in range(values.shape[0]):
+            plane[nodes[tap], k] += weight * values[k]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _spread_view(
+    values: Floats,
+    weights: Floats,
+    channels: Channels,
+    plane: Floats,
+    light_nodes: Ints,
+    light_taps: Floats,
+    factor: Floats,
+    of_samples: bool,
+    spread: Floats,
+) -> None:
+    """Add the adjoint of one texel's samples from one view to `spread`."""
+    at = np.zeros(plane.shape[1], np.float32)
+    for j in range(len(values)):
+        if weights[j] == 0:
+            continue
+        at_light(plane, light_nodes[j], light_taps[j], at)
+        for c in range(3):
+            value = values[j, c]
+            if not of_samples:
+                value = np.float32(0)
+                for k in range(len(factor)):
+                    value += factor[k] * at[3 * k + c]
+            weight = weights[j] * (channels[j] >> c & 1)
+            for k in range(len(factor)):
+                at[3 * k + c] = factor[k] * weight * value
+        _spread(spread, light_nodes[j], light_taps[j], at)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _spread_over_views(
+    spread: Floats, nodes: Ints, weights: Floats, touched: Ints, out: Floats
+) -> None:
+    for tap in range(4):
+        if weights[tap] != 0:
+            target = out[nodes[tap]]
+            for a in touched:
+                for k in range(target.shape[1]):
+                    target[a, k] += weights[tap] * spread[a, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate(
+    values: Floats,
+    view_nodes: Ints,
+    view_taps: Floats,
+    light_nodes: Ints,
+    light_taps: Floats,
+    view_weights: Floats,
+    light_weights: Floats,
+    pairs: Floats,
+    channels: Channels,
+    cluster: Ints,
+    coefficients: Floats,
+    table: Floats,
+    of_samples: bool,
+    out: Floats,
+) -> None:
+    """Add A^T W A table to `out`, or A^T W values if `of_samples`."""
+    plane = np.zeros(table.shape[2:], np.float32)
+    spread = np.zeros(table.shape[2:], np.float32)
+    factor = np.ones(table.shape[3] // 3, np.float32)
+    lit = np.zeros(table.shape[2], np.int32)
+    every = np.full(values.shape[2], ALL_CHANNELS, np.uint8)
+    for t in range(len(values)):
+        touched = lit[: touched_nodes(light_nodes[t], light_weights[t], lit)]
+        factor[1:] = coefficients[t]
+        for i in np.flatnonzero(view_weights[t]):
+            weights = view_weights[t, i] * light_weights[t] * pairs[i]
+            taps = (view_nodes[t, i], view_taps[t, i])
+            clear(spread, touched)
+            if not of_samples:
+                at_view(table[cluster[t]], *taps, touched, plane)
+            _spread_view(
+                values[t, i],
+                weights,
+                channels[t, i] if len(channels) else every,
+                plane,
+                light_nodes[t],
+                light_taps[t],
+                factor,
+                of_samples,
+                spread,
+            )
+            _spread_over_views(spread, *taps, touched, out[cluster[t]])
+
+
+@dataclass(frozen=True, eq=False)
+class BasisProblem:
+    """Normal equations of mean and basis for fixed coefficients."""
+
+    rooted: RootedSamples
+    cluster: Ints
+    coefficients: Floats
+    smoothness: float
+    pool: ThreadPoolExecutor
+
+    def sums(self, table: Floats, of_samples: bool) -> Floats:
+        """Add up A^T W A table over all texels, or A^T W values if `of_samples`."""
+
+        def part_sum(part: slice) -> Floats:
+            out = np.zeros_like(table)
+            _accumulate(
+                *arguments(self.rooted, part),
+                self.cluster[part],
+                self.coefficients[part],
+                table,
+                of_samples,
+                out,
+            )
+            return out
+
+        total = np.zeros_like(table)
+        for out in self.pool.map(part_sum, parts(len(self.cluster))):
+            total += out
+        return total
+
+    def samples_per_node(self, n_clusters: int, n_nodes: int) -> NDArray[np.float32]:
+        """Mean weight of a pair of nodes in each cluster; scales the regularisation."""
+        rooted = self.rooted
+        weight = np.einsum(
+            "ti,ij,tj->t", rooted.view_weights, rooted.pairs, rooted.light_weights
+        )
+        if rooted.has_gaps:
+            pairs = rooted.pairs * rooted.measured().mean(axis=3, dtype=np.float32)
+            weight = np.einsum("ti,tij,tj->t", rooted.view_weights, pairs, rooted.light_weights)
+        total = np.bincount(self.cluster, weight, minlength=n_clusters)
+        return np.maximum(total / n_nodes, 1e-6).astype(np.float32)
+
+    def solve(self, table: Floats, iterations: int) -> Floats:
+        """Conjugate gradients, each cluster with its own step."""
+        n_clusters, n_views, n_lights, _ = table.shape
+        density = self.samples_per_node(n_clusters, n_views * n_lights)
+        strength = (self.smoothness * density)[:, None, None, None]
+
+        def normal(x: Floats) -> Floats:
+            return self.sums(x, of_samples=False) + strength * (roughness(x) + 0.01 * x)
+
+        rest = self.sums(table, of_samples=True) - normal(table)
+        direction = rest.copy()
+        energy = _dot(rest, rest)
+        # Steps stop per cluster once rounding in float32 dominates.
+        floor = 1e-10 * np.maximum(energy, LEAST_ENERGY)
+        for _ in range(iterations):
+            image = normal(direction)
+            step = np.where(
+                energy > floor, energy / np.maximum(_dot(direction, image), LEAST_ENERGY), 0
+            )
+            table = table + step.astype(np.float32)[:, None, None, None] * direction
+            rest = rest - step.astype(np.float32)[:, None, None, None] * image
+            renewed = _dot(rest, rest)
+            ratio = (renewed / np.maximum(energy, LEAST_ENERGY)).astype(np.float32)
+            direction = rest + ratio[:, None, None, None] * direction
+            energy = renewed
+        return table
+
+
+def _dot(a: Floats, b: Floats) -> NDArray[np.float64]:
+    n = len(a)
+    return np.einsum("cx,cx->c", a.reshape(n, -1), b.reshape(n, -1), dtype=np.float64)
+
+
+def roughness(table: Floats) -> Floats:
+    """Sum of differences to neighbouring nodes along both grids' rows and columns.
+
+    The gradient of half the sum of squared differences; used as the regulariser.
+    """
+    n_clusters, n_views, n_lights, width = table.shape
+    v, m = int(np.sqrt(n_views)), int(np.sqrt(n_lights))
+    grid = table.reshape(n_clusters, v, v, m, m, width)
+    out = np.zeros_like(grid)
+    for axis in range(1, 5):
+        difference = np.diff(grid, axis=axis)
+        lower = [slice(None)] * 6
+        upper = [slice(None)] * 6
+        lower[axis], upper[axis] = slice(0, -1), slice(1, None)
+        out[tuple(lower)] -= difference
+        out[tuple(upper)] += difference
+    return out.reshape(table.shape)

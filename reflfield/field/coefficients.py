@@ -1,0 +1,231 @@
+"""Coefficients of texels for a fixed basis: a small solve per texel with a Gaussian prior.
+
+Where a texel would be brighter than its bounds allow (`field.bounds`) its prior grows, no
+further than the errors of its samples let it.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.field.bounds import exceeds, probes, raise_top
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.sample_sums import arguments, at_light, at_view, parts, touched_nodes
+from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, RootedSamples
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+# The prior of a texel beyond its bounds grows by this, so many times at most.
+STRENGTHENING, STRENGTHENINGS = 4.0, 8
+# Standard deviations that coefficients may thereby differ from what the samples give.
+ALLOWED_DEVIATION = 3.0
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _add_normal_equations(
+    values: Floats,
+    weights: Floats,
+    channels: Channels,
+    plane: Floats,
+    light_nodes: Ints,
+    light_taps: Floats,
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    squares: NDArray[np.float64],
+) -> None:
+    """Add one texel's samples from one view: values (n_lights, 3), weights (n_lights,).
+
+    `channels` (n_lights,) has the bits of those that were measured.
+    """
+    n_components = len(right)
+    at = np.zeros(plane.shape[1], np.float32)
+    for j in range(len(values)):
+        if weights[j] == 0:
+            continue
+        at_light(plane, light_nodes[j], light_taps[j], at)
+        for c in range(3):
+            if not channels[j] >> c & 1:
+                continue
+            squares[1] += weights[j]
+            rest = values[j, c] - at[c]
+            squares[0] += weights[j] * rest * rest
+            for k in range(n_components):
+                moment = weights[j] * at[3 * (k + 1) + c]
+                right[k] += moment * rest
+                for m in range(k + 1):
+                    normal[k, m] += moment * at[3 * (m + 1) + c]
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve_texel(
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    n_values: int,
+    coefficients: Floats,
+    squares: NDArray[np.float64],
+) -> None:
+    """Coefficients of one texel; its squared residual falls by what they explain."""
+    full = np.tril(normal) + np.tril(normal, -1).T
+    found = np.linalg.solve(full + precision, right)
+    coefficients[:] = found
+    explained = 2 * np.dot(found, right) - np.dot(found, np.dot(full, found))
+    squares[0] = max(squares[0] - explained, 0.0)
+    # Each coefficient that the samples determine takes one of the values, of mean weight:
+    # without this the noise is underestimated, the prior is too weak, and texels with few
+    # samples overfit.
+    determined = np.trace(np.linalg.solve(full + precision, full))
+    squares[1] *= max(1.0 - determined / n_values, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve_bounded(
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    n_values: int,
+    at_probes: Floats,
+    top: Floats,
+    coefficients: Floats,
+    squares: NDArray[np.float64],
+) -> None:
+    """Coefficients of one texel, with as strong a prior as keeps it within its bounds.
+
+    The stronger prior moves first what the samples say least of. It goes no further than their
+    errors allow: a texel that they show to be unlike its cluster remains so.
+    """
+    before = squares.copy()
+    _solve_texel(normal, right, precision, n_values, coefficients, squares)
+    noise = max(squares[0] / max(squares[1], 1e-30), np.trace(precision) / len(right))
+    most = squares[0] + ALLOWED_DEVIATION**2 * len(right) * noise
+    step = 0
+    while step < STRENGTHENINGS and exceeds(at_probes, coefficients, top):
+        step += 1
+        stronger = precision * STRENGTHENING**step
+        weaker, rest = coefficients.copy(), before.copy()
+        _solve_texel(normal, right, stronger, n_values, coefficients, rest)
+        if rest[0] > most:
+            coefficients[:] = weaker
+            return
+        squares[:] = rest
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_values(weights: Floats, channels: Channels) -> int:
+    """Number of values that were measured, of samples with weight."""
+    count = 0
+    for j in range(len(weights)):
+        if weights[j] != 0:
+            for c in range(3):
+                count += channels[j] >> c & 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve_coefficients(
+    values: Floats,
+    view_nodes: Ints,
+    view_taps: Floats,
+    light_nodes: Ints,
+    light_taps: Floats,
+    view_weights: Floats,
+    light_weights: Floats,
+    pairs: Floats,
+    channels: Channels,
+    cluster: Ints,
+    table: Floats,
+    precision: NDArray[np.float64],
+    at_probes: Floats,
+    coefficients: Floats,
+    squares: NDArray[np.float64],
+) -> None:
+    n_components = precision.shape[1]
+    plane = np.zeros(table.shape[2:], np.float32)
+    lit = np.zeros(table.shape[2], np.int32)
+    every = np.full(values.shape[2], ALL_CHANNELS, np.uint8)
+    for t in range(len(values)):
+        touched = lit[: touched_nodes(light_nodes[t], light_weights[t], lit)]
+        normal = np.zeros((n_components, n_components))
+        right = np.zeros(n_components)
+        n_values = 0
+        top = np.zeros(3, np.float32)
+        for i in np.flatnonzero(view_weights[t]):
+            weights = view_weights[t, i] * light_weights[t] * pairs[i]
+            measured = channels[t, i] if len(channels) else every
+            n_values += _count_values(weights, measured)
+            raise_top(values[t, i], weights, measured, top)
+            taps = (view_nodes[t, i], view_taps[t, i])
+            at_view(table[cluster[t]], *taps, touched, plane)
+            _add_normal_equations(
+                values[t, i],
+                weights,
+                measured,
+                plane,
+                light_nodes[t],
+                light_taps[t],
+                normal,
+                right,
+                squares[t],
+            )
+        if squares[t, 1] > 0 and n_components > 0:
+            c = cluster[t]
+            _solve_bounded(
+                *(normal, right, precision[c], n_values, at_probes[c], top),
+                *(coefficients[t], squares[t]),
+            )
+
+
+def solve_coefficients(
+    rooted: RootedSamples,
+    cluster: Ints,
+    model: ClusteredModel,
+    pool: ThreadPoolExecutor,
+    *,
+    bounded: bool = False,
+) -> tuple[Floats, NDArray[np.float64]]:
+    """Coefficients of texels for a fixed basis.
+
+    Parameters
+    ----------
+    rooted : RootedSamples
+        Samples of n texels.
+    cluster : (n,) int32
+    model : ClusteredModel
+        Its `table` and `precision` are used.
+    pool : ThreadPoolExecutor
+    bounded : bool
+        Whether a texel may be nowhere brighter than its samples and, by a factor, than the
+        mean of its cluster: where it was not observed its coefficients may say anything.
+
+    Returns
+    -------
+    coefficients : (n, K) float32
+        Zero for a texel without samples.
+    squares : (n, 2) float64
+        Weighted squared residual of each texel, and its degrees of freedom: total weight
+        (channels counted), less the share of the values that coefficients are determined by.
+    """
+    n_components = model.precision.shape[1]
+    coefficients = np.zeros((len(cluster), n_components), np.float32)
+    squares = np.zeros((len(cluster), 2))
+    at_probes = probes(model.table)[:, : None if bounded else 0]
+
+    def solve(part: slice) -> None:
+        _solve_coefficients(
+            *arguments(rooted, part),
+            cluster[part],
+            model.table,
+            model.precision,
+            at_probes,
+            coefficients[part],
+            squares[part],
+        )
+
+    for _ in pool.map(solve, parts(len(cluster))):
+        pass
+    return coefficients, squares

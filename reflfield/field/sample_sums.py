@@ -1,0 +1,92 @@
+"""What all sums over samples share: functions on the nodes at the directions of samples.
+
+A table (n_view_nodes, n_light_nodes, width) is interpolated at a sample's view first, which
+leaves functions of the light alone, and only at the light nodes that the texel's samples lie
+between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.observations.texel_samples import RootedSamples
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
+
+# Partial sums are formed for this many parts and added in order, so that the result does
+# not depend on the number of workers.
+N_PARTS = 8
+
+
+@numba.njit(cache=True, nogil=True)
+def touched_nodes(nodes: Ints, weights: Floats, found: Ints) -> int:
+    """Number of light nodes that samples of one texel lie between; they are put in `found`."""
+    is_touched = np.zeros(len(found), np.bool_)
+    for j in range(len(nodes)):
+        if weights[j] != 0:
+            for tap in range(4):
+                is_touched[nodes[j, tap]] = True
+    count = 0
+    for node in range(len(found)):
+        if is_touched[node]:
+            found[count] = node
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def clear(plane: Floats, touched: Ints) -> None:
+    """Zero the rows (n_light_nodes, width) of the nodes that matter."""
+    for a in touched:
+        for k in range(plane.shape[1]):
+            plane[a, k] = 0
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def at_view(table: Floats, nodes: Ints, weights: Floats, touched: Ints, out: Floats) -> None:
+    """Functions of the light alone, at the nodes that matter."""
+    clear(out, touched)
+    for tap in range(4):
+        weight = weights[tap]
+        if weight != 0:
+            plane = table[nodes[tap]]
+            for a in touched:
+                for k in range(out.shape[1]):
+                    out[a, k] += weight * plane[a, k]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def at_light(plane: Floats, nodes: Ints, weights: Floats, out: Floats) -> None:
+    """Interpolate functions of the light (n_light_nodes, width) at one light."""
+    out[:] = 0
+    for tap in range(4):
+        weight = weights[tap]
+        for k in range(out.shape[0]):
+            out[k] += weight * plane[nodes[tap], k]
+
+
+def arguments(rooted: RootedSamples, part: slice) -> tuple[NDArray[np.generic], ...]:
+    """Arrays of some texels' samples, in the order in which the sums take them."""
+    return (
+        rooted.values[part],
+        rooted.view_taps[0][part],
+        rooted.view_taps[1][part],
+        rooted.light_taps[0][part],
+        rooted.light_taps[1][part],
+        rooted.view_weights[part],
+        rooted.light_weights[part],
+        rooted.pairs,
+        rooted.channels[part],
+    )
+
+
+def parts(n: int) -> Iterator[slice]:
+    """Slices of n texels, `N_PARTS` at most."""
+    edges = np.linspace(0, n, N_PARTS + 1).astype(int)
+    return (slice(a, b) for a, b in pairwise(edges) if b > a)
