@@ -7,28 +7,15 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from reflfield import __version__
-from reflfield.capture.names import printable
 from reflfield.errors import InputError, ReflfieldError
-from reflfield.interrupts import Stopped, ending_on_signals, leaving_work_in_order
-from reflfield.progress import ProgressLines, listening
+from reflfield.interrupts import ending_on_signals
+from reflfield.terminal import say, say_error, showing_progress
 
 # The libraries that do the work take seconds to import: commands import what they need,
 # so that --help and wrong arguments answer at once.
@@ -40,7 +27,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="Dome photographs to relightable objects.",
 )
-errors = Console(stderr=True, highlight=False)
 MISSED = 3  # status where the quality that was asked for is not reached
 LONGEST_MESSAGE = 1600
 GOES_ON = "the same command goes on where it stopped"
@@ -125,62 +111,6 @@ def fail(message: str, error: Exception) -> NoReturn:
         whole = f"{whole[: LONGEST_MESSAGE // 2]} ... {whole[-LONGEST_MESSAGE // 4 :]}"
     say_error(f"reflfield: error: {whole}")
     sys.exit(2)
-
-
-@contextmanager
-def showing_progress(if_interrupted: str = "nothing half-written is left") -> Iterator[None]:
-    """Show the progress of all work inside the block, with the time left.
-
-    On a terminal as bars, else as a line now and then. Ctrl-C ends with status 130, a request
-    to terminate with 143.
-    """
-    try:
-        shown = bars() if errors.is_terminal else listening(ProgressLines(say_error))
-        with leaving_work_in_order(), shown:
-            yield
-    except Stopped as signal:
-        say_error(f"reflfield: {signal.word}; {if_interrupted}")
-        raise typer.Exit(signal.status) from None
-
-
-@contextmanager
-def bars() -> Iterator[None]:
-    """Progress bars on the terminal."""
-    columns = (
-        TextColumn("{task.description:<38}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=errors) as shown:
-        tasks: dict[str, TaskID] = {}
-
-        def listen(description: str, done: int, total: int) -> None:
-            if done == 0 or description not in tasks:
-                if description in tasks:
-                    shown.remove_task(tasks[description])
-                tasks[description] = shown.add_task(description, total=total)
-            shown.update(tasks[description], completed=done, total=total)
-
-        with listening(listen):
-            yield
-
-
-def say_error(line: str) -> None:
-    """One line on standard error, with what cannot be printed escaped."""
-    errors.print(printable(line), markup=False, soft_wrap=True)
-
-
-def say(line: str) -> None:
-    """One line of result on standard output, with what cannot be printed escaped."""
-    try:
-        print(printable(line), flush=True)
-    except BrokenPipeError:  # the reader has what it wanted
-        raise
-    except OSError as error:
-        error.filename = "standard output"
-        raise
 
 
 @app.callback(invoke_without_command=True)

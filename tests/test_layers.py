@@ -38,6 +38,7 @@ ROOMS = (
     "steps",
     "pipeline",
     "demo",
+    "terminal",
     "cli",
     "__main__",
 )

@@ -15,6 +15,7 @@ from rich.console import Console
 
 import reflfield as package
 import reflfield.cli as cli
+from reflfield import terminal
 from reflfield.capture.image_files import read_coverage
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.comparison.metrics import object_pixels
@@ -109,7 +110,7 @@ class TestProgress:
 
     def test_goes_to_stderr(self, reflfield, finished, tiny_capture, tmp_path, monkeypatch):
         monkeypatch.setattr(
-            cli, "ProgressLines", lambda write: ProgressLines(write, interval=0.0)
+            terminal, "ProgressLines", lambda write: ProgressLines(write, interval=0.0)
         )
         outcome = reflfield(
             *("relight", finished.folder / "field.rfld", "-o", tmp_path / "out"),
@@ -121,9 +122,9 @@ class TestProgress:
 
     def test_bars_on_a_terminal_say_how_much_is_left(self, monkeypatch):
         shown = io.StringIO()
-        terminal = Console(file=shown, force_terminal=True, width=120)
-        monkeypatch.setattr(cli, "errors", terminal)
-        with cli.showing_progress():
+        console = Console(file=shown, force_terminal=True, width=120)
+        monkeypatch.setattr(terminal, "errors", console)
+        with terminal.showing_progress():
             for done in (0, 1, 2, 0, 2):  # a second round takes the place of the first
                 report("views", done, 2)
         # Without colours and cursor movements, the last picture of the bars.

@@ -14,6 +14,7 @@ from reflfield.stages import StageFolder
 KILLED_AT = """
 import os, signal, sys
 import reflfield.cli as cli
+from reflfield import terminal
 
 last = int(sys.argv.pop(1))
 
@@ -25,7 +26,7 @@ class Killer:
         if self.steps == last:
             os.kill(os.getpid(), signal.SIGKILL)
 
-cli.ProgressLines = Killer
+terminal.ProgressLines = Killer
 cli.main()
 """
 # What only the basis needs is not looked at again once that is done.
