@@ -45,8 +45,8 @@ class Contradiction:
         Examples
         --------
         >>> Contradiction("v005", 0.42, 0.71, None).words(13)
-        "v005: its silhouette contradicts the 13 others (it leaves no room for 42 % of what \
-they show, they leave none for 71 % of it); check its camera and its silhouette"
+        'v005: its silhouette contradicts the 13 others (it leaves no room for 42 % of what \
+they show, they leave none for 71 % of it); check its camera and its silhouette'
         """
         text = (
             f"{printable(self.view)}: its silhouette contradicts the {n_others} others (it "

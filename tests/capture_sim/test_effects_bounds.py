@@ -91,7 +91,7 @@ def test_what_auto_leaves_out_is_below_the_tolerance():
         "light_variation": {"intensity": 1e-6, "colour": 1e-6},
         "environment": {"radiance": 1e-7, "samples": 16},
         "vignetting": {"coefficients": [-1e-5], "cos4": False},
-        "quantisation": {"bits": 24},
+        "quantisation": {"bits": 24, "full_scale": 100.0},
     }
     described = scene("sphere", "satin", **tiny)
     tracer = RayTracer(described.mesh)

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings
@@ -17,6 +18,7 @@ from capture_sim.plan import plan
 from capture_sim.scene import load_scene, parse_scene
 from capture_sim.write import MOST_WORKERS, write_capture
 
+# Of what a plan may take beside what the process of the tests holds by then.
 CEILING = 1 << 30
 SCENE = {
     "name": "tiny",
@@ -134,8 +136,9 @@ def fuzzed_scenes(folder, examples):
 def planned(path):
     """Plan a scene; what is wrong with it, if anything."""
     try:
-        with memory_limit(CEILING), np.errstate(all="ignore"):
-            lines = plan(load_scene(str(path)), max_memory=CEILING).lines()
+        ceiling = psutil.Process().memory_info().rss + CEILING
+        with memory_limit(ceiling), np.errstate(all="ignore"):
+            lines = plan(load_scene(str(path)), max_memory=ceiling).lines()
     except SceneError as error:
         return str(error)
     assert lines
