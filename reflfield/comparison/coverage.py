@@ -21,7 +21,7 @@ Float32 = NDArray[np.float32]
 
 # Where a silhouette comes from.
 GIVEN, ALPHA, PHOTOGRAPHS, HULL, IMAGE = "given", "alpha", "photographs", "hull", "image"
-# Under fewer lights a side of the object may be dark in all photographs of a view.
+# Under fewer lamps a side of the object may be dark in all photographs of a view.
 LEAST_PHOTOGRAPHS = 4
 ORIGINS = "origins.json"
 HEADER_BYTES = 4096
@@ -66,8 +66,8 @@ def write_frame_silhouettes(
 
     The one given for the view; else the alpha of its photographs; else, where the base
     surface is a plane, the whole image; else one made from all photographs of its camera,
-    held out or not, if they are `LEAST_PHOTOGRAPHS` or more and show an object; else the mesh
-    as the camera sees it.
+    held out or not, if they are `LEAST_PHOTOGRAPHS` or more, or taken in the one unknown light
+    that the field holds, and show an object; else the mesh as the camera sees it.
 
     Parameters
     ----------
@@ -111,7 +111,8 @@ def _coverage(capture: Capture, view: int, scene: RayScene) -> tuple[Float32, st
         return alpha, ALPHA
     if capture.base_geometry == PLANE:
         return capture.read_silhouette(view), IMAGE
-    if sum(p.camera == view for p in capture.photographs) >= LEAST_PHOTOGRAPHS:
+    enough = LEAST_PHOTOGRAPHS if capture.lights_known else 1
+    if sum(p.camera == view for p in capture.photographs) >= enough:
         try:
             return capture.read_silhouette(view), PHOTOGRAPHS
         except CaptureError:  # all dark: no object is found in them

@@ -8,6 +8,7 @@ import pytest
 
 from reflfield.capture.image_files import read_image
 from reflfield.capture.image_writing import write_exr
+from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.readers import open_capture
 from reflfield.comparison.coverage import projected_coverage, write_frame_silhouettes
 from reflfield.comparison.metrics import object_pixels
@@ -90,6 +91,16 @@ class TestWhereTheyComeFrom:
             # The hull of all other views has the outline of the object to the pixel.
             outline = rim(true_capture.read_silhouette(ids.index(camera.id)))
             assert (truth ^ measured).sum() <= outline
+
+    def test_in_one_unknown_light_the_photograph_is(self, true_capture, hull, tmp_path):
+        one = unmasked(true_capture).subset(lights=[0])
+        capture = replace(one, lights=(Light("room", UNKNOWN),))
+        frames = frames_of(capture, HoldOut(views=2))
+        silhouettes = made(capture, frames, hull, tmp_path)
+        assert silhouettes.origins == ("photographs", "photographs")
+        view = [camera.id for camera in capture.cameras].index(frames.cameras[0].id)
+        expected = capture.read_silhouette(view)
+        np.testing.assert_allclose(silhouettes.read(0), expected, atol=0.51 / 255)
 
     def test_where_all_photographs_are_dark_the_hull_is(
         self, tiny_capture, true_capture, hull, tmp_path, monkeypatch
