@@ -25,7 +25,7 @@ from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.bounding_box import object_bounds
 from reflfield.geometry.carving import Grid, carve
 from reflfield.geometry.cones import View, measured_views
-from reflfield.geometry.contradictions import FINEST_VOTES
+from reflfield.geometry.contradictions import CONTRADICTION, FINEST_VOTES
 from reflfield.geometry.disagreement import Contradiction, Disagreement
 from reflfield.geometry.explanations import (
     compared_pixels,
@@ -60,6 +60,9 @@ _SUSPICIOUS_IF_THIN = 0.25
 _COLLAPSED = 0.1
 # Median share of the silhouettes on which views must agree for a hull to be of use.
 _HOPELESS = 0.5
+
+# Fewer views than these do not outweigh one that says the object is larger.
+LEAST_WITNESSES = 6
 
 
 @dataclass(frozen=True)
@@ -316,6 +319,14 @@ def _outcome_with_outliers(
         others = None
     contradictions = tuple(_contradictions(views, silhouettes, disagreement, others))
     words = [contradiction.words(len(kept)) for contradiction in contradictions]
+    harmless = len(kept) < LEAST_WITNESSES and all(
+        one.spoilt < CONTRADICTION and one.explanation is None for one in contradictions
+    )
+    if options.tolerance == AUTO and usable is not None and harmless:
+        # A silhouette that is too large removes nothing of the object, and where no mistake
+        # explains it, it may be the few others that miss a dark side.
+        said = tuple(f"{text}; the hull is made with it" for text in words)
+        return _Outcome(usable, contradictions, (), said)
     if options.tolerance == AUTO and others is not None:
         left_out = tuple(contradiction.view for contradiction in contradictions)
         said = tuple(f"{text}; the hull is made without it" for text in words)

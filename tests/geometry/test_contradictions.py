@@ -248,3 +248,18 @@ def test_small_parts_that_other_views_show_as_well_stay(rig):
     assert report.specks == {}
     assert report.warnings == ()
     assert np.linalg.norm(mesh.vertices - satellite, axis=1).min() < 0.06
+
+
+def test_few_views_do_not_outweigh_one_that_shows_more():
+    """A part that three others lack removes nothing: the view is named and stays."""
+    views = rigs.cameras(12, size=64, zoom=1.4)[:4]
+    masks = [rigs.lobed_silhouette(view) for view in views]
+    without, _ = visual_hull(views, masks, COARSE)
+    masks[1] = masks[1].copy()
+    masks[1][2:62, 44:62] = 1.0
+    mesh, report = visual_hull(views, masks, COARSE)
+    assert report.left_out == ()
+    assert [one.view for one in report.contradictions] == ["v001"]
+    assert report.warnings[0].endswith("the hull is made with it")
+    # The part itself is carved away by the others, but where they cannot see behind it.
+    assert mesh.volume >= without.volume * (1 - 1e-6)
