@@ -7,17 +7,18 @@ from types import FrameType
 
 def main() -> None:
     """Run the command."""
-    # Libraries take seconds to be imported, and some catch whatever is raised meanwhile.
-    signal.signal(signal.SIGINT, _end)
+    # Libraries take seconds to be imported, and some catch whatever is raised meanwhile, as
+    # does the parser of the command line; what writes files asks for an exception instead.
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _end)
     from capture_sim.cli import main as run
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     run()
 
 
 def _end(number: int, frame: FrameType | None) -> None:
     del number, frame
-    os.write(2, b"capture-sim: interrupted; nothing was written\n")
+    os.write(2, b"capture-sim: interrupted\n")
     os._exit(130)
 
 

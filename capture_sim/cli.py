@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -197,9 +198,14 @@ def _fail(message: str) -> NoReturn:
 
 @contextmanager
 def _interruptible(left: str) -> Iterator[None]:
-    """End with status 130 and one line after Ctrl-C."""
+    """End with status 130 and one line after Ctrl-C, once what was begun is in order."""
+    before = signal.getsignal(signal.SIGINT)
     try:
+        if before is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         yield
     except KeyboardInterrupt:
         print(f"capture-sim: interrupted; {left}", file=sys.stderr)
         sys.exit(130)
+    finally:
+        signal.signal(signal.SIGINT, before)
