@@ -44,12 +44,12 @@ from synthetic_btf import (  # noqa: E402
 )
 
 from reflfield.alignment import align, search  # noqa: E402
-from reflfield.alignment.climbing import follow  # noqa: E402
 from reflfield.alignment.correlation import spectrum  # noqa: E402
+from reflfield.alignment.newton_ascent import follow  # noqa: E402
 from reflfield.alignment.refinement import RefinementOptions  # noqa: E402
-from reflfield.comparison.plots import SERIES_COLOURS  # noqa: E402
+from reflfield.report.plots import SERIES_COLOURS  # noqa: E402
 from reflfield.sphere.coupling import couple  # noqa: E402
-from reflfield.sphere.projection import Projector  # noqa: E402
+from reflfield.sphere.harmonic_projection import Projector  # noqa: E402
 
 RANKS = (2, 4, 6, 8)
 NEWTON_STEPS = 12

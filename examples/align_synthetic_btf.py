@@ -31,7 +31,7 @@ from synthetic_btf import (
 )
 
 from reflfield.alignment import align
-from reflfield.comparison.plots import SERIES_COLOURS
+from reflfield.report.plots import SERIES_COLOURS
 
 matplotlib.use("Agg")
 from matplotlib import pyplot

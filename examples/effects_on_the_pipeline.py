@@ -37,12 +37,12 @@ from capture_sim.model import Scene
 from capture_sim.scene import load_scene
 from capture_sim.write import write_capture
 from reflfield.capture.readers import open_capture
-from reflfield.comparison.truth_files import open_truth
-from reflfield.config import Resources, read_toml, with_tables
 from reflfield.field.file import open_field
-from reflfield.pipeline import run
-from reflfield.steps import evaluation
-from reflfield.steps.options import PipelineOptions
+from reflfield.metrics.truth_files import open_truth
+from reflfield.options import Resources, read_toml, with_tables
+from reflfield.pipeline import comparison
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.stages import run
 
 NOTHING = "none"
 # What every capture has: these make the image, they do not spoil it.
@@ -85,10 +85,10 @@ def score(capture: Path, out: Path, options: PipelineOptions, workers: int) -> d
     job = run(open_capture(capture), out, options, resources=resources, last="comparison")
     truth = open_truth(capture)
     field = open_field(job.stages.root / "compression" / "field.rfld")
-    frames, _ = evaluation.frame_scores(job, truth, field)
+    frames, _ = comparison.frame_scores(job, truth, field)
     return {
-        "psnr": evaluation.stored_comparison(job, "truth")["mean"]["psnr_ldr"],
-        "hull_mm": evaluation.hull_score(job, truth).summary()["mean_mm"],
+        "psnr": comparison.stored_comparison(job, "truth")["mean"]["psnr_ldr"],
+        "hull_mm": comparison.hull_score(job, truth).summary()["mean_mm"],
         "normal_deg": frames.summary()["normal_median_deg"],
         "tangent_deg": frames.summary()["tangent_median_deg"],
     }

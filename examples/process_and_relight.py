@@ -16,12 +16,12 @@ from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.image_writing import write_png
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
-from reflfield.config import read_toml, with_tables
 from reflfield.field.file import open_field
-from reflfield.pipeline import run
-from reflfield.relighting.exposure import encoded_picture
-from reflfield.relighting.renderer import render
-from reflfield.steps.options import PipelineOptions
+from reflfield.options import read_toml, with_tables
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.stages import run
+from reflfield.render.exposure import encoded_picture
+from reflfield.render.renderer import render
 
 
 def novel_camera(positions: np.ndarray, up: np.ndarray, size: int) -> Camera:

@@ -2,7 +2,7 @@
 
 See Müller, Sarlette and Klein, "Data-driven Local Coordinate Systems for
 Image-Based Rendering", Eurographics 2006, for the method that this package
-implements and extends. The stages stand in order in `reflfield.pipeline`.
+implements and extends. The stages stand in order in `reflfield.pipeline.stages`.
 """
 
 __version__ = "0.1.0"

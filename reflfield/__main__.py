@@ -1,6 +1,6 @@
 """The command ``reflfield``, ready for Ctrl-C before the libraries are imported."""
 
-from reflfield.interrupts import ending_on_signals
+from reflfield.util.interrupts import ending_on_signals
 
 
 def main() -> None:

@@ -14,8 +14,8 @@ import typer
 
 from reflfield import __version__
 from reflfield.errors import InputError, ReflfieldError
-from reflfield.interrupts import ending_on_signals
-from reflfield.terminal import say, say_error, showing_progress
+from reflfield.util.interrupts import ending_on_signals
+from reflfield.util.terminal import say, say_error, showing_progress
 
 # The libraries that do the work take seconds to import: commands import what they need,
 # so that --help and wrong arguments answer at once.
@@ -187,8 +187,8 @@ def run(
     Status 0: done. 2: input cannot be used. 3: done, but --psnr is not reached. 130: Ctrl-C.
     """
     from reflfield.capture.readers import open_capture
-    from reflfield.config import Resources, parse_bytes, parse_hold_out
-    from reflfield.pipeline import run as run_pipeline
+    from reflfield.options import Resources, parse_bytes, parse_hold_out
+    from reflfield.pipeline.stages import run as run_pipeline
 
     started = time.perf_counter()
     options = pipeline_options(config, [*(set_ or []), *size_settings(size, psnr)])
@@ -251,7 +251,7 @@ def relight(
 ) -> None:
     """Render frames, or a turntable under an environment map or a distant light."""
     from reflfield.field.file import open_field
-    from reflfield.steps.turntables import TurntableLighting, write_turntable
+    from reflfield.pipeline.turntables import TurntableLighting, write_turntable
 
     if (frames is None) == (orbit is None):
         raise InputError("relight: expected either --frames FRAMES or --orbit N, one of them")
@@ -278,8 +278,8 @@ def relight(
 
 def picture_limits(samples: int, workers: int, max_memory: str) -> Any:
     """Options of pictures, and what they may use."""
-    from reflfield.config import Resources, parse_bytes
-    from reflfield.relighting.renderer import RenderOptions
+    from reflfield.options import Resources, parse_bytes
+    from reflfield.render.renderer import RenderOptions
 
     resources = Resources(n_workers(workers), parse_bytes(max_memory))
     return RenderOptions(samples_per_pixel=samples, workers=resources.workers), resources
@@ -297,8 +297,8 @@ def relight_to(
 ) -> list[Path]:
     """Relight frames; their EXR files."""
     from reflfield.capture.readers import open_capture
-    from reflfield.steps.memory import check_frames_memory
-    from reflfield.steps.standalone import write_relit_frames
+    from reflfield.pipeline.memory import check_frames_memory
+    from reflfield.pipeline.standalone import write_relit_frames
 
     opened = open_capture(frames, require_photographs=False, **reading)
     return write_relit_frames(field, opened, out, check_frames_memory(field, opened, *limits))
@@ -320,8 +320,8 @@ def compare(
     """Relight frames and measure them against their photographs."""
     from reflfield.capture.readers import open_capture
     from reflfield.field.file import open_field
-    from reflfield.steps.memory import check_frames_memory
-    from reflfield.steps.standalone import write_standalone_comparison
+    from reflfield.pipeline.memory import check_frames_memory
+    from reflfield.pipeline.standalone import write_standalone_comparison
 
     limits = picture_limits(samples, workers, max_memory)
     opened = open_field(field, max_bytes=limits[1].max_memory)
@@ -345,7 +345,7 @@ def inspect(
     layer: LayerOption = None,
 ) -> None:
     """Say what a capture or a field holds."""
-    from reflfield.config import parse_bytes
+    from reflfield.options import parse_bytes
 
     most_bytes = parse_bytes(max_memory)
     if path.suffix.lower() == ".rfld":
@@ -378,7 +378,7 @@ def image_reading(encoding: str | None, layer: str | None) -> Any:
 
 def n_workers(wanted: int) -> int:
     """Threads to use; 0 takes one per core that this process may use."""
-    from reflfield.config import MOST_WORKERS, available_cores
+    from reflfield.options import MOST_WORKERS, available_cores
 
     if not 0 <= wanted <= MOST_WORKERS:
         raise InputError(
@@ -389,8 +389,8 @@ def n_workers(wanted: int) -> int:
 
 def pipeline_options(config: Path | None, settings: list[str]) -> Any:
     """Options from a file, overridden by single settings."""
-    from reflfield.config import merged, parse_settings, read_toml, with_tables
-    from reflfield.steps.options import PipelineOptions
+    from reflfield.options import merged, parse_settings, read_toml, with_tables
+    from reflfield.pipeline.pipeline_options import PipelineOptions
 
     tables = read_toml(config) if config is not None else {}
     return with_tables(PipelineOptions(), merged(tables, parse_settings(settings)))
@@ -398,7 +398,7 @@ def pipeline_options(config: Path | None, settings: list[str]) -> Any:
 
 def size_settings(size: str, psnr: float | None) -> list[str]:
     """Settings of the size or quality that was asked for; neither asks for nothing."""
-    from reflfield.config import parse_bytes
+    from reflfield.options import parse_bytes
 
     settings = []
     if size:
@@ -414,11 +414,11 @@ def size_settings(size: str, psnr: float | None) -> list[str]:
 
 def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
-    from reflfield.steps.choices import words_of
-    from reflfield.steps.holding_out import held_out_words, left_out_words
-    from reflfield.steps.outputs import problems_of
-    from reflfield.steps.publishing import published
-    from reflfield.steps.quantising import missed_quality
+    from reflfield.pipeline.hold_out import held_out_words, left_out_words
+    from reflfield.pipeline.model_selection import words_of
+    from reflfield.pipeline.outputs import problems_of
+    from reflfield.pipeline.publishing import published
+    from reflfield.pipeline.quantising import missed_quality
 
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"

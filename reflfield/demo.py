@@ -10,21 +10,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from reflfield.capture.readers import open_capture
-from reflfield.children import tied
-from reflfield.config import HoldOut, Resources
 from reflfield.errors import ReflfieldError
-from reflfield.field.compression import CompressionOptions
+from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.fit import SampleFitOptions
-from reflfield.pipeline import run
-from reflfield.progress import report
-from reflfield.steps.job import Job
-from reflfield.steps.options import (
+from reflfield.options import HoldOut, Resources
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.pipeline_options import (
     AlignmentOptions,
     ComparisonOptions,
     CompletionOptions,
     PipelineOptions,
     TextureOptions,
 )
+from reflfield.pipeline.stages import run
+from reflfield.util.child_processes import tied
+from reflfield.util.progress import report
 
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)

@@ -1,4 +1,4 @@
-"""Imports run one way: each room uses only those before it, none hides in a function."""
+"""Imports run one way: each package uses only those before it, none hides in a function."""
 
 import ast
 from collections.abc import Iterator
@@ -9,21 +9,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# From the ground up. A room may import itself and any room to its left.
-ROOMS = (
+# From the ground up. A package may import itself and any package above it.
+PACKAGES = (
     "errors",
-    "interrupts",
-    "children",
-    "checks",
-    "files",
-    "folders",
-    "checksums",
-    "code_digests",
-    "file_digests",
-    "progress",
-    "config",
-    "cluster",
-    "scheduling",
+    "util",
+    "options",
     "sphere",
     "factorization",
     "capture",
@@ -31,14 +21,12 @@ ROOMS = (
     "observations",
     "alignment",
     "field",
-    "relighting",
-    "comparison",
+    "render",
+    "metrics",
     "export",
-    "stages",
-    "steps",
+    "report",
     "pipeline",
     "demo",
-    "terminal",
     "cli",
     "__main__",
 )
@@ -66,7 +54,7 @@ def imports_of(tree: ast.AST, package: str, inside: bool = False) -> Iterator[Im
             parts = package.split(".")[: len(package.split(".")) - node.level + 1]
             base = ".".join(parts if node.level else [])
             module = ".".join(filter(None, (base, node.module)))
-            # "from package import room" names the room only among the imported names.
+            # "from package import name" names the package only among the imported names.
             yield from (
                 Import(node.lineno, f"{module}.{alias.name}", inside) for alias in node.names
             )
@@ -83,38 +71,38 @@ def imports_in(path: Path) -> list[Import]:
     return list(imports_of(tree, ".".join(path.parent.parts)))
 
 
-def room_of(path: Path) -> str:
+def package_of(path: Path) -> str:
     return Path(path.parts[1]).stem
 
 
-def breaches(room: str, found: list[Import]) -> list[Import]:
-    """Imports of rooms that come later than `room`."""
-    allowed = ROOMS[: ROOMS.index(room) + 1]
+def breaches(package: str, found: list[Import]) -> list[Import]:
+    """Imports of packages that come later than `package`."""
+    allowed = PACKAGES[: PACKAGES.index(package) + 1]
     return [
         one
         for one in found
         if one.module.startswith("reflfield.")
-        and (name := one.module.split(".")[1]) in ROOMS
+        and (name := one.module.split(".")[1]) in PACKAGES
         and name not in allowed
     ]
 
 
-def test_every_room_has_its_place():
-    present = {room_of(path) for path in modules("reflfield")} - {"__init__"}
-    assert present == set(ROOMS)
+def test_every_package_has_its_place():
+    present = {package_of(path) for path in modules("reflfield")} - {"__init__"}
+    assert present == set(PACKAGES)
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_rooms_import_only_earlier_rooms(room):
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_import_only_earlier_packages(package):
     found = {
-        str(path): breaches(room, imports_in(path))
+        str(path): breaches(package, imports_in(path))
         for path in modules("reflfield")
-        if room_of(path) == room
+        if package_of(path) == package
     }
     assert {path: bad for path, bad in found.items() if bad} == {}
 
 
-def test_the_package_itself_imports_no_room():
+def test_the_package_itself_imports_no_package():
     assert imports_in(Path("reflfield/__init__.py")) == []
 
 
@@ -145,17 +133,17 @@ def test_no_import_hides_inside_a_function(package):
 
 def test_the_check_sees_what_it_must():
     source = (
-        "from reflfield.field import model\n"
-        "from reflfield import relighting\n"
-        "from ..pipeline import run\n"
+        "from reflfield.field import evaluation\n"
+        "from reflfield import render\n"
+        "from ..pipeline.stages import run\n"
         "def later():\n"
         "    import reflfield.cli\n"
     )
     found = list(imports_of(ast.parse(source), "reflfield.field"))
     assert [one.module for one in found] == [
-        "reflfield.field.model",
-        "reflfield.relighting",
-        "reflfield.pipeline.run",
+        "reflfield.field.evaluation",
+        "reflfield.render",
+        "reflfield.pipeline.stages.run",
         "reflfield.cli",
     ]
     assert [one.inside_function for one in found] == [False, False, False, True]

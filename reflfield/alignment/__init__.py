@@ -1,10 +1,10 @@
 """Local frames from reflectance: correlation over SO(3), clusters, refinement, normal maps."""
 
 from reflfield.alignment.aligning import Alignment, align
+from reflfield.alignment.alignment_samples import SampleSource
 from reflfield.alignment.normal_maps import local_map, world_map
 from reflfield.alignment.refinement import RefinementOptions
-from reflfield.alignment.samples import SampleSource
-from reflfield.alignment.searching import SearchResult, search
+from reflfield.alignment.rotation_search import SearchResult, search
 
 __all__ = [
     "Alignment",

@@ -8,8 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment.expectation import TargetFit, fit_targets, mean_targets
-from reflfield.alignment.gauge import (
+from reflfield.alignment.alignment_samples import (
+    SampleSource,
+    as_source,
+    blocks_of,
+    mean_samples,
+    read_unit,
+)
+from reflfield.alignment.expectation_maximisation import TargetFit, fit_targets, mean_targets
+from reflfield.alignment.frame_ambiguity import (
     Gauged,
     fix_gauge,
     fold,
@@ -18,6 +25,7 @@ from reflfield.alignment.gauge import (
     turns_are_open,
 )
 from reflfield.alignment.horizon import Horizon, extend_targets, settle
+from reflfield.alignment.in_plane_rotation import best_turns, find_turns, turn_margin
 from reflfield.alignment.materials import (
     Materials,
     choose,
@@ -31,29 +39,21 @@ from reflfield.alignment.refinement import (
     improve_frames,
     refine_targets,
 )
-from reflfield.alignment.samples import (
-    SampleSource,
-    as_source,
-    blocks_of,
-    mean_samples,
-    read_unit,
-)
-from reflfield.alignment.searching import (
+from reflfield.alignment.rotation_search import (
     SearchOptions,
     SearchResult,
     map_blocks,
     search,
 )
 from reflfield.alignment.splines import NodeTargets
-from reflfield.alignment.turning import best_turns, find_turns, turn_margin
-from reflfield.checks import unit_directions
 from reflfield.errors import InputError, ShapeError
-from reflfield.progress import track
-from reflfield.scheduling import one_core_blas
 from reflfield.sphere.coupling import Coupled, couple, join_coupled
+from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.harmonics import check_band_limit
-from reflfield.sphere.projection import Projector
 from reflfield.sphere.rotations import rotation_angle
+from reflfield.util.blas_threads import one_core_blas
+from reflfield.util.progress import track
+from reflfield.util.validation import unit_directions
 
 # Texels whose coefficients are kept for the iterations: enough that their mean
 # has converged far below the error of one frame.

@@ -19,10 +19,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.expectation import TargetFit, climb_near, mean_targets, mean_weights
-from reflfield.alignment.searching import SearchOptions, SearchResult, map_blocks
+from reflfield.alignment.expectation_maximisation import (
+    TargetFit,
+    climb_near,
+    mean_targets,
+    mean_weights,
+)
+from reflfield.alignment.rotation_search import SearchOptions, SearchResult, map_blocks
 from reflfield.sphere.coupling import Coupled, couple, join_coupled, rotate_coupled, uncouple
-from reflfield.sphere.projection import Projector
+from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.wigner import rotation_blocks
 
 BLOCK = 256

@@ -27,7 +27,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.gauge import mean_rotation
+from reflfield.alignment.frame_ambiguity import mean_rotation
 from reflfield.alignment.refinement import (
     BLOCK,
     RefinementOptions,
@@ -35,7 +35,7 @@ from reflfield.alignment.refinement import (
     fit_nodes,
     improve_frames,
 )
-from reflfield.alignment.searching import map_blocks
+from reflfield.alignment.rotation_search import map_blocks
 from reflfield.alignment.splines import NodeTargets, expect, place
 from reflfield.sphere.hemisphere import LOWEST_Z, first_tap, square_from_xyz
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.util.validation import check_shape
 
 
 def local_map(

@@ -18,9 +18,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.climbing import copy_matrix, turned
-from reflfield.alignment.climbing import scale as shrink
-from reflfield.alignment.searching import map_blocks
+from reflfield.alignment.newton_ascent import copy_matrix, turned
+from reflfield.alignment.newton_ascent import scale as shrink
+from reflfield.alignment.rotation_search import map_blocks
 from reflfield.alignment.splines import (
     FAST,
     NodeTargets,
@@ -29,8 +29,8 @@ from reflfield.alignment.splines import (
     place,
     value_at,
 )
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.util.validation import check_shape
 
 LONGEST_STEP = np.deg2rad(4.0)
 SHORT_STEP = np.deg2rad(0.01)

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.gauge import mean_rotation
+from reflfield.alignment.frame_ambiguity import mean_rotation
 from reflfield.alignment.refinement import (
     RefinementOptions,
     SampleSet,
@@ -21,8 +21,8 @@ from reflfield.alignment.refinement import (
     refine_targets,
 )
 from reflfield.alignment.splines import NodeTargets
-from reflfield.checks import check_shape
-from reflfield.progress import track
+from reflfield.util.progress import track
+from reflfield.util.validation import check_shape
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture import lenses
-from reflfield.checks import check_shape
 from reflfield.errors import CaptureError
+from reflfield.util.validation import check_shape
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from reflfield.capture.capture import Capture, check_matches
 from reflfield.capture.image_files import image_orientation, image_size
 from reflfield.capture.lights import ENVIRONMENT, GROUP
-from reflfield.capture.model import Capture, check_matches
 from reflfield.errors import CaptureError
 
 

@@ -27,7 +27,7 @@ from reflfield.capture.image_headers import READABLE, ImageHeader, check_png, ch
 from reflfield.capture.image_layers import Layer
 from reflfield.capture.stated_color import radiance_scale, stated_space
 from reflfield.errors import CaptureError
-from reflfield.files import utf8_name
+from reflfield.util.files import utf8_name
 
 Float32 = NDArray[np.float32]
 

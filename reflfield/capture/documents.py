@@ -13,9 +13,9 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.names import quoted
 from reflfield.errors import CaptureError
-from reflfield.files import read_bytes
+from reflfield.util.files import read_bytes
+from reflfield.util.quoting import quoted
 
 # 151 x 151 frames of transforms.json with all its keys, indented, are about 45 MB.
 MAX_DOCUMENT_BYTES = 80 * 2**20

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 
 from reflfield.errors import InputError
-from reflfield.files import read_bytes
+from reflfield.util.files import read_bytes
 
 Float32 = NDArray[np.float32]
 

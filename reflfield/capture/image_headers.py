@@ -24,7 +24,7 @@ from reflfield.capture.tiff_headers import (
     read_tiff_pages,
 )
 from reflfield.errors import CaptureError
-from reflfield.files import check_regular
+from reflfield.util.files import check_regular
 
 # A header that asks for more is damaged or hostile; the largest cameras have 151 million.
 MAX_PIXELS = 160_000_000

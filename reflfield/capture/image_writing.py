@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.files import replacing, utf8_name
+from reflfield.util.files import replacing, utf8_name
 
 
 def write_exr(

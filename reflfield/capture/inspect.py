@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import ORTHOGRAPHIC
+from reflfield.capture.capture import PLANE, Capture
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT
-from reflfield.capture.model import PLANE, Capture
-from reflfield.progress import track
+from reflfield.util.progress import track
 
 Range = tuple[float, float]
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import check_shape, not_a_rotation_because
 from reflfield.errors import CaptureError, InputError
+from reflfield.util.validation import check_shape, not_a_rotation_because
 
 Array = NDArray[np.float64]
 

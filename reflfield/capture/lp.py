@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import PLANE, Capture, Exposure, Photograph
 from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
 from reflfield.capture.image_files import image_size
 from reflfield.capture.lights import LARGEST_COORDINATE, Light
-from reflfield.capture.model import PLANE, Capture, Exposure, Photograph
-from reflfield.capture.names import printable, quoted, unique_names
+from reflfield.capture.names import unique_names
 from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError
+from reflfield.util.quoting import printable, quoted
 
 SUFFIX = ".lp"
 IMAGE_WIDTH = 1.0  # metres

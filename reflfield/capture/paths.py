@@ -8,8 +8,8 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
-from reflfield.capture.names import has_controls, quoted
 from reflfield.errors import CaptureError
+from reflfield.util.quoting import has_controls, quoted
 
 # Bytes of a path, and of one of its parts, which is what file systems allow.
 LONGEST_PATH, LONGEST_PART = 1000, 255

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from reflfield.capture.cameras import ORTHOGRAPHIC
+from reflfield.capture.capture import Capture
 from reflfield.capture.image_files import largest_code_of_16
 from reflfield.capture.inspect import object_centre, spread_evenly
 from reflfield.capture.lights import POINT, SPOT
-from reflfield.capture.model import Capture
 from reflfield.errors import CaptureError
 
 # 16-bit files that hold sensors' codes as they are have at most 12 bits set, one in sixteen of

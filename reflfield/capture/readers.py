@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from reflfield.capture import lp, middlebury, native, transforms_json
+from reflfield.capture.capture import Capture
 from reflfield.capture.consistency import (
     check_environments,
     check_lights,
@@ -18,11 +19,10 @@ from reflfield.capture.consistency import (
 )
 from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.image_files import AS_STATED, ImageReading
-from reflfield.capture.model import Capture
 from reflfield.capture.plausibility import check_code_range, far_lights
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
-from reflfield.files import check_regular
+from reflfield.util.files import check_regular
 
 _logger = logging.getLogger(__name__)
 

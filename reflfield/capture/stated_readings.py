@@ -9,9 +9,9 @@ from typing import Any
 from reflfield.capture.documents import number
 from reflfield.capture.encoding import parse_encoding
 from reflfield.capture.image_files import AS_STATED, ImageReading
-from reflfield.capture.names import quoted
 from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError, InputError
+from reflfield.util.quoting import quoted
 
 READING_KEYS = ("encoding", "layer", "white_level")
 

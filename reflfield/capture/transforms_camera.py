@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from reflfield.capture.cameras import FISHEYE, LONGEST_SIDE, OPENCV, Camera, not_rigid_because
 from reflfield.capture.documents import number, number_array
 from reflfield.capture.image_files import image_size
-from reflfield.capture.names import quoted
 from reflfield.capture.transforms_frame import LENS_KEYS, Frame
 from reflfield.errors import CaptureError
+from reflfield.util.quoting import quoted
 
 # Camera models and the coefficients that each has; others must be 0.
 MODELS = {

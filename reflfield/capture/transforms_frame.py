@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.documents import number
-from reflfield.capture.names import quoted
 from reflfield.capture.stated_readings import READING_KEYS
 from reflfield.errors import CaptureError
+from reflfield.util.quoting import quoted
 
 LENS_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")

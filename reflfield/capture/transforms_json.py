@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.documents import check_counts, number_array, read_json
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph, usual_base_geometry
-from reflfield.capture.names import IMAGE_SUFFIXES, printable, quoted, unique_names
+from reflfield.capture.names import IMAGE_SUFFIXES, unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
 from reflfield.capture.stated_readings import READING_KEYS, stated_reading
@@ -32,6 +32,7 @@ from reflfield.capture.transforms_camera import CAMERA_KEYS, frame_camera, frame
 from reflfield.capture.transforms_frame import SPLIT_KEYS, Frame, check_keys, leading_digits
 from reflfield.capture.transforms_light import LIGHT_KEYS, check_lights, frame_light
 from reflfield.errors import CaptureError
+from reflfield.util.quoting import printable, quoted
 
 FILE_NAME = "transforms.json"
 TRAIN_NAME = "transforms_train.json"

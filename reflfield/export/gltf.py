@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
-from reflfield.files import replacing
-from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import unit_or_zero
 from reflfield.geometry.texels import frames, texture_axes
+from reflfield.geometry.uv_atlas import Atlas
+from reflfield.util.files import replacing
+from reflfield.util.validation import check_shape
 
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963  # targets of buffer views: what a GPU binds them as

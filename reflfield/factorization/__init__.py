@@ -1,9 +1,14 @@
 """Matrices in, matrices out: completion, online SVD, local PCA. Knows nothing of captures."""
 
-from reflfield.factorization.completion import Completion, complete
+from reflfield.factorization.column_sources import (
+    ArraySource,
+    BlockSource,
+    ColumnSource,
+    as_source,
+)
 from reflfield.factorization.local_pca import ClusteredBasis, LocalPCA
-from reflfield.factorization.online import OnlineSVD
-from reflfield.factorization.sources import ArraySource, BlockSource, ColumnSource, as_source
+from reflfield.factorization.online_svd import OnlineSVD
+from reflfield.factorization.svd_completion import Completion, complete
 
 __all__ = [
     "ArraySource",

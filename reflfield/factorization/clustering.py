@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.progress import report
+from reflfield.util.progress import report
 
 Array = NDArray[Any]
 SEEDING_DIMENSIONS = 16

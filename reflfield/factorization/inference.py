@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import ShapeError
-from reflfield.factorization.completion import Completion, map_coefficients
-from reflfield.factorization.recursive import Model, floored
-from reflfield.factorization.sources import as_source, reader_of
+from reflfield.factorization.column_sources import as_source, reader_of
+from reflfield.factorization.recursive_least_squares import Model, floored
+from reflfield.factorization.svd_completion import Completion, map_coefficients
 
 
 def infer_coefficients(

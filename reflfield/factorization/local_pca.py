@@ -15,11 +15,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
 from reflfield.factorization.clustering import Clusters, cluster_columns, updated
-from reflfield.factorization.completion import one_pass
-from reflfield.factorization.recursive import (
+from reflfield.factorization.column_sources import (
+    Block,
+    Columns,
+    Reader,
+    as_source,
+    blocks_of,
+    reader_of,
+)
+from reflfield.factorization.recursive_least_squares import (
     Model,
     floored,
     gram_of_samples,
@@ -28,15 +34,9 @@ from reflfield.factorization.recursive import (
     squared_residual,
     with_moments,
 )
-from reflfield.factorization.sources import (
-    Block,
-    Columns,
-    Reader,
-    as_source,
-    blocks_of,
-    reader_of,
-)
+from reflfield.factorization.svd_completion import one_pass
 from reflfield.factorization.workspace import Workspace, completed_workspace, pca_workspace
+from reflfield.util.validation import check_shape
 
 Array = NDArray[Any]
 # What the lifted row weighs, in observations, when a cluster's rows are solved for again.

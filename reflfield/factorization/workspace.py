@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.factorization.completion import fit_map, map_coefficients
-from reflfield.factorization.sources import Reader, blocks_of
-from reflfield.progress import report
+from reflfield.factorization.column_sources import Reader, blocks_of
+from reflfield.factorization.svd_completion import fit_map, map_coefficients
+from reflfield.util.progress import report
 
 Array = NDArray[Any]
 # Random directions beyond those wanted; Halko, Martinsson, Tropp, SIAM Review 53, 2011.

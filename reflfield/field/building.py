@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
-from reflfield.field.indirect import IndirectLight, no_indirect_light
-from reflfield.field.model import (
+from reflfield.field.indirect_light import IndirectLight, no_indirect_light
+from reflfield.field.quantisation import (
+    SMALLEST_TURN,
+    check_finite,
+    codes_from_rotations,
+    lattice_points,
+)
+from reflfield.field.reflectance_field import (
     Domain,
     LightModel,
     ReflectanceField,
@@ -25,19 +30,14 @@ from reflfield.field.model import (
     check_options,
     node_side,
 )
-from reflfield.field.quantisation import (
-    SMALLEST_TURN,
-    check_finite,
-    codes_from_rotations,
-    lattice_points,
-)
 from reflfield.field.transform import (
     factor_table,
     lattice_codes,
     smallest_codes,
     unfactor_table,
 )
-from reflfield.scheduling import one_core_blas
+from reflfield.util.blas_threads import one_core_blas
+from reflfield.util.validation import check_shape
 
 # Steps along the longest side of the object: .01 mm of 16 cm, a hundredth of a texel.
 POSITION_STEPS = 16383

@@ -15,11 +15,11 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import UNIT_TOLERANCE, check_shape
 from reflfield.errors import InputError
-from reflfield.field.model import ReflectanceField
 from reflfield.field.quantisation import check_finite
+from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.sphere.hemisphere import first_tap, softened_cosine_of, square_from_xyz
+from reflfield.util.validation import UNIT_TOLERANCE, check_shape
 
 # Kernel helpers are typed by numba; to mypy their scalars are Any.
 

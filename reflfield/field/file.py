@@ -29,21 +29,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import FieldFileError, InputError
-from reflfield.field.model import (
+from reflfield.field.packing import FILTERS, pack, unpack
+from reflfield.field.reflectance_field import (
     ARRAYS,
     ReflectanceField,
     check_arrays,
     check_options,
     node_side,
 )
-from reflfield.field.packing import FILTERS, pack, unpack
 from reflfield.field.stored_values import (
     LONGEST_AXIS,
     check_lengths,
     check_stored,
     memory_needed,
 )
-from reflfield.files import check_regular, replacing
+from reflfield.util.files import check_regular, replacing
 
 FORMAT_NAME = "reflfield-field"
 FORMAT_VERSION = 3

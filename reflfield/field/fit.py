@@ -21,13 +21,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.checks import check_ranges
 from reflfield.errors import InputError
 from reflfield.field.basis import BasisProblem
 from reflfield.field.clustered_model import ClusteredModel, normalised
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.observations.texel_samples import RootedSamples
-from reflfield.progress import report, track
+from reflfield.util.progress import report, track
+from reflfield.util.validation import check_ranges
 
 Reader = Callable[[NDArray[np.intp]], RootedSamples]
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from reflfield.checks import unit_directions
+from reflfield.util.validation import unit_directions
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

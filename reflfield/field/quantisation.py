@@ -8,9 +8,9 @@ import numba
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
 from reflfield.sphere.rotations import matrix_from_quaternion, quaternion_from_matrix
+from reflfield.util.validation import check_shape
 
 # Half a turn in steps of this fits the codes of a turn.
 SMALLEST_TURN = 1e-4

@@ -10,7 +10,7 @@ import numpy as np
 
 from reflfield.errors import InputError
 from reflfield.field.file import PackedSizes
-from reflfield.field.model import ReflectanceField
+from reflfield.field.reflectance_field import ReflectanceField
 
 Build = Callable[[float], ReflectanceField]
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.model import ARRAYS, check_indices
 from reflfield.field.quantisation import SMALLEST_TURN, check_finite
+from reflfield.field.reflectance_field import ARRAYS, check_indices
 
 # Largest magnitude of a step, scale or function: times any code it stays finite as a single.
 LARGEST_VALUE = 1e25

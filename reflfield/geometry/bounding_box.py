@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from reflfield.capture.names import listed
 from reflfield.errors import GeometryError
 from reflfield.geometry.carving import refuse_empty
 from reflfield.geometry.cones import View, normalised
+from reflfield.util.quoting import listed
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.errors import InputError
-from reflfield.geometry.silhouettes import SignedDistance, signed_distance
-from reflfield.progress import track
+from reflfield.geometry.silhouette_distance import SignedDistance, signed_distance
+from reflfield.util.progress import track
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.names import listed, printable
 from reflfield.geometry.cones import View
 from reflfield.geometry.contradictions import CONTRADICTION, Verdict
 from reflfield.geometry.explanations import Explanation, examine
+from reflfield.util.quoting import listed, printable
 
 Array = NDArray[np.float64]
 Corner = tuple[float, float, float]

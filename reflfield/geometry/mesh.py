@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from reflfield.checks import check_shape
 from reflfield.errors import GeometryError, InputError
-from reflfield.files import replacing
 from reflfield.geometry.open3d_library import open3d
+from reflfield.util.files import replacing
+from reflfield.util.validation import check_shape
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.errors import GeometryError
-from reflfield.geometry.atlas import Atlas
+from reflfield.geometry.uv_atlas import Atlas
 
 Array = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
-from reflfield.checks import check_shape
-from reflfield.config import available_cores
 from reflfield.errors import ShapeError
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.open3d_library import open3d
+from reflfield.options import available_cores
+from reflfield.util.validation import check_shape
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

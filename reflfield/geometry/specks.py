@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.names import listed
 from reflfield.errors import GeometryError
 from reflfield.geometry.bounding_box import robust_bounds
 from reflfield.geometry.cones import View
 from reflfield.geometry.contradictions import best_on_rays, best_score, votes_of
-from reflfield.geometry.silhouettes import signed_distance
+from reflfield.geometry.silhouette_distance import signed_distance
+from reflfield.util.quoting import listed
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import unit_or_zero
+from reflfield.geometry.uv_atlas import Atlas
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT, Light
-from reflfield.capture.model import Capture
 
 Array = NDArray[np.float64]
 

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.storage import FsspecStore
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
-from reflfield.files import naming
+from reflfield.util.files import naming
+from reflfield.util.validation import check_shape
 
 Bools = NDArray[np.bool_]
 # A folder, or the URL of one for fsspec, such as ``s3://bucket/name``.

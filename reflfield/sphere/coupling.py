@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from reflfield.checks import check_shape
 from reflfield.sphere.harmonics import check_band_limit
-from reflfield.sphere.recombining import Recombination, recombination
+from reflfield.sphere.sparse_recombination import Recombination, recombination
+from reflfield.util.validation import check_shape
 
 BandLimits = tuple[int, int]
 # Coefficients of degrees up to 15 are zero, but for 1e-14 of rounding, or above 1e-9.

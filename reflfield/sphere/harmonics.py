@@ -17,8 +17,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import unit_directions
 from reflfield.errors import InputError
+from reflfield.util.validation import unit_directions
 
 MAX_BAND_LIMIT = 257
 

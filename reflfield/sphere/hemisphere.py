@@ -20,8 +20,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.util.validation import check_shape
 
 QUARTER_PI = np.pi / 4
 # Half of the step by which the taps' positions are differenced, radians: well below the

@@ -21,8 +21,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.checks import check_shape
 from reflfield.errors import InputError
+from reflfield.util.validation import check_shape
 
 # Rows of stored d are whole cache lines of single precision, for vector instructions.
 LINE = 16

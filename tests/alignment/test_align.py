@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import RefinementOptions, align
-from reflfield.alignment.gauge import mean_rotation
+from reflfield.alignment.frame_ambiguity import mean_rotation
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.rotations import frames_from_normals
 
@@ -126,7 +126,8 @@ def test_blocks_from_a_source_give_the_same_as_an_array(relief, monkeypatch):
             return samples[rows]
 
     monkeypatch.setattr("reflfield.alignment.aligning.TRAINING_TEXELS", 60)
-    monkeypatch.setattr("reflfield.alignment.samples.BLOCK_BYTES", samples[0].nbytes * 7)
+    block_bytes = "reflfield.alignment.alignment_samples.BLOCK_BYTES"
+    monkeypatch.setattr(block_bytes, samples[0].nbytes * 7)
     one = align(samples, directions, directions, iterations=2)
     two = align(Disk(), directions, directions, iterations=2, n_threads=2)
     assert np.array_equal(one.local_from_base, two.local_from_base)

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import RefinementOptions, align, search
-from reflfield.alignment.climbing import follow
 from reflfield.alignment.correlation import spectrum
+from reflfield.alignment.newton_ascent import follow
 from reflfield.sphere.coupling import Coupled, couple, rotate_coupled
-from reflfield.sphere.projection import Projector
+from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.rotations import frames_from_normals, rotation_angle
 from reflfield.sphere.wigner import rotation_blocks
 

@@ -3,11 +3,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import align
-from reflfield.alignment.expectation import TargetFit
+from reflfield.alignment.expectation_maximisation import TargetFit
 from reflfield.alignment.horizon import Horizon, extend_targets, settle
-from reflfield.alignment.searching import search
+from reflfield.alignment.rotation_search import search
 from reflfield.sphere.coupling import Coupled, couple, rotate_coupled
-from reflfield.sphere.projection import Projector
+from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.wigner import rotation_blocks
 
 OPTIONS = {"max_tilt": None, "n_threads": 1}

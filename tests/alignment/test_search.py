@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment import search, searching
-from reflfield.alignment.climbing import follow
+from reflfield.alignment import rotation_search, search
 from reflfield.alignment.correlation import spectrum
-from reflfield.alignment.searching import odd_share, rotation_about
+from reflfield.alignment.newton_ascent import follow
+from reflfield.alignment.rotation_search import odd_share, rotation_about
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.coupling import Coupled, couple, rotate_coupled, uncouple
 from reflfield.sphere.rotations import rotation_angle
@@ -120,7 +120,7 @@ def nearly_symmetric(target, odd):
 @pytest.mark.parametrize("odd", [0.0, 1e-3, 0.02])
 def test_of_two_sides_that_hardly_differ_the_better_is_found(odd, rng):
     target = nearly_symmetric(couple(lobes(rng, 1, 6)), odd)
-    assert odd_share(target) < searching.SYMMETRIC_SHARE
+    assert odd_share(target) < rotation_search.SYMMETRIC_SHARE
     truth = Rotation.random(100, random_state=5).as_matrix()
     result = search(turned_copies(target, truth), target)
     found = result.rotations
@@ -141,7 +141,7 @@ def test_climbing_one_of_two_sides_loses_nothing(half_turns, rng, monkeypatch):
     noise = 0.3 * lobes(rng, 100, 6)
     source = couple(uncouple(source) + noise)
     short = search(source, target, half_turns=half_turns)
-    monkeypatch.setattr(searching, "SYMMETRIC_SHARE", 0.0)
+    monkeypatch.setattr(rotation_search, "SYMMETRIC_SHARE", 0.0)
     full = search(source, target, half_turns=half_turns)
     # Of two sides within a thousandth, the full search keeps the one that it climbs first.
     assert np.all(short.score >= full.score * (1 - 1e-6))

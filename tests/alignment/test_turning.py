@@ -5,14 +5,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import RefinementOptions, align
-from reflfield.alignment.gauge import fix_gauge, turns_are_open
+from reflfield.alignment.frame_ambiguity import fix_gauge, turns_are_open
+from reflfield.alignment.in_plane_rotation import N_TURNS, best_turns, turn_margin, turn_misfits
 from reflfield.alignment.materials import Materials
 from reflfield.alignment.refinement import SampleSet
 from reflfield.alignment.splines import NodeTargets
-from reflfield.alignment.turning import N_TURNS, best_turns, turn_margin, turn_misfits
 from reflfield.sphere.coupling import couple
+from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.hemisphere import HemisphereGrid
-from reflfield.sphere.projection import Projector
 
 QUICK = RefinementOptions(side=13, rounds=3, last_steps=3)
 

@@ -20,7 +20,7 @@ from benchmarks.peers import Pysofft, S2fft
 
 from reflfield.alignment import align, search
 from reflfield.sphere.coupling import couple
-from reflfield.sphere.projection import Projector
+from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.rotations import rotation_angle
 
 RANKS = (4, 6)

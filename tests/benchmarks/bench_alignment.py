@@ -41,15 +41,15 @@ from synthetic_btf import (  # noqa: E402
 )
 
 from reflfield.alignment import search  # noqa: E402
-from reflfield.alignment.climbing import follow  # noqa: E402
 from reflfield.alignment.correlation import spectrum  # noqa: E402
+from reflfield.alignment.newton_ascent import follow  # noqa: E402
 from reflfield.sphere.coupling import couple  # noqa: E402
-from reflfield.sphere.hemisphere import HemisphereGrid  # noqa: E402
-from reflfield.sphere.projection import (  # noqa: E402
+from reflfield.sphere.harmonic_projection import (  # noqa: E402
     Projector,
     direction_operator,
     solid_angles,
 )
+from reflfield.sphere.hemisphere import HemisphereGrid  # noqa: E402
 
 METHODS = HERE / "alignment_methods.py"
 SIDE = 25  # of the target's nodes in the sums over samples

@@ -27,7 +27,7 @@ from sklearn.utils.extmath import randomized_svd
 
 from reflfield.factorization import LocalPCA, OnlineSVD, as_source, complete
 from reflfield.factorization.clustering import alternate, updated
-from reflfield.factorization.sources import reader_of
+from reflfield.factorization.column_sources import reader_of
 from reflfield.factorization.workspace import pca_workspace
 
 RANK = 12

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture, Exposure, Photograph
 from reflfield.capture.clipping import measured_values
 from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph
 
 SIZE = 40
 

@@ -8,7 +8,7 @@ import pytest
 
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError
-from reflfield.pipeline import run
+from reflfield.pipeline.stages import run
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
 

@@ -6,7 +6,7 @@ import pytest
 
 from reflfield.capture.encoding import decode_srgb
 from reflfield.capture.readers import open_capture
-from reflfield.capture.silhouettes import SilhouetteOptions, silhouette_from_photographs
+from reflfield.capture.segmentation import SilhouetteOptions, silhouette_from_photographs
 from reflfield.errors import CaptureError, InputError
 
 SIZE = 160

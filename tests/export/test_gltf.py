@@ -10,7 +10,7 @@ from PIL import Image
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.export.gltf import vertex_tangents, write_glb
-from reflfield.geometry.atlas import Atlas
+from reflfield.geometry.uv_atlas import Atlas
 
 # Asymmetric: red top left, green top right, blue bottom left, white bottom right.
 TEXTURE = (

@@ -8,7 +8,7 @@ from sklearn.decomposition import IncrementalPCA
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.factorization import OnlineSVD
-from reflfield.factorization.online import orthonormal_range, outside
+from reflfield.factorization.online_svd import orthonormal_range, outside
 
 
 def fed(matrix, rank, block, *, dtype=np.float64, mean=False):

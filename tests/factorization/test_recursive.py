@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
-from reflfield.factorization.packed import outer_products, pack, unpack
-from reflfield.factorization.recursive import Model, RowStatistics, gram_of_samples, infer
-from reflfield.factorization.sources import Block, as_source, reader_of
-from reflfield.factorization.start import start_model, unbiased
+from reflfield.factorization.column_sources import Block, as_source, reader_of
+from reflfield.factorization.initialisation import start_model, unbiased
+from reflfield.factorization.packed_matrices import outer_products, pack, unpack
+from reflfield.factorization.recursive_least_squares import (
+    Model,
+    RowStatistics,
+    gram_of_samples,
+    infer,
+)
 
 from .problems import problem
 

@@ -7,7 +7,7 @@ import pytest
 
 from reflfield.errors import InputError
 from reflfield.factorization import complete
-from reflfield.field.compression import (
+from reflfield.field.clustered_pca import (
     CompressionOptions,
     _precision,
     cluster_completed,

@@ -14,7 +14,7 @@ from reflfield.field import file as field_file
 from reflfield.field.building import Quantisation
 from reflfield.field.evaluation import evaluate
 from reflfield.field.file import FORMAT_VERSION, describe, open_field, write_field
-from reflfield.field.model import ARRAYS
+from reflfield.field.reflectance_field import ARRAYS
 from reflfield.field.synthetic import baked_field, lambert, square_surface
 
 

@@ -15,7 +15,7 @@ from reflfield.errors import FieldFileError, InputError
 from reflfield.field import file as field_file
 from reflfield.field.evaluation import evaluate
 from reflfield.field.file import describe, open_field, write_field
-from reflfield.field.model import ARRAYS
+from reflfield.field.reflectance_field import ARRAYS
 
 N_TEXELS = 60
 

@@ -8,7 +8,7 @@ import pytest
 from reflfield.errors import InputError, ShapeError
 from reflfield.field.building import FittedReflectance, Quantisation, build_field
 from reflfield.field.evaluation import sum_lights
-from reflfield.field.indirect import (
+from reflfield.field.indirect_light import (
     IndirectLight,
     Systems,
     band_limit_for,
@@ -17,7 +17,7 @@ from reflfield.field.indirect import (
 )
 from reflfield.field.observed_sphere import covered
 from reflfield.field.synthetic import square_surface
-from reflfield.observations.reading import Shade
+from reflfield.observations.texel_reading import Shade
 from reflfield.sphere.harmonics import real_harmonics
 
 N_LIGHTS, N_COMPONENTS = 30, 3
@@ -233,7 +233,7 @@ def test_no_texel_is_made_brighter_than_it_was_seen(monkeypatch, rng):
 
     # The sample, and three standard deviations of its noise and of the model's.
     assert brightest() < 0.1 + 6 * 0.02
-    monkeypatch.setattr("reflfield.field.indirect.LIMIT_ROUNDS", 0)
+    monkeypatch.setattr("reflfield.field.indirect_light.LIMIT_ROUNDS", 0)
     assert brightest() > 0.5
 
 

@@ -8,8 +8,11 @@ import trimesh
 
 from reflfield.capture.cameras import Camera
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry import atlas as atlas_module
-from reflfield.geometry.atlas import (
+from reflfield.geometry import uv_atlas as atlas_module
+from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.plane import image_plane
+from reflfield.geometry.texels import TexelOptions, frames, texel_table, texture_axes
+from reflfield.geometry.uv_atlas import (
     Atlas,
     AtlasOptions,
     AtlasWarning,
@@ -17,9 +20,6 @@ from reflfield.geometry.atlas import (
     build_atlas,
     built_atlas,
 )
-from reflfield.geometry.mesh import Mesh
-from reflfield.geometry.plane import image_plane
-from reflfield.geometry.texels import TexelOptions, frames, texel_table, texture_axes
 
 
 def torus(scale=1.0, origin=0.0):
@@ -247,7 +247,7 @@ def test_the_worker_is_refused_more_memory_than_it_may_take():
 def test_the_worker_is_found_from_any_folder(tmp_path):
     script = (
         "import numpy as np\n"
-        "from reflfield.geometry.atlas import build_atlas\n"
+        "from reflfield.geometry.uv_atlas import build_atlas\n"
         "from reflfield.geometry.mesh import Mesh\n"
         "atlas = build_atlas(Mesh([[0,0,0],[1,0,0],[0,1,0]], [[0,1,2]]))\n"
         "raise SystemExit(0 if atlas.n_charts == 1 else 1)\n"

@@ -7,7 +7,7 @@ import pytest
 import rigs
 
 from reflfield.errors import GeometryError
-from reflfield.geometry.hull import HullOptions, visual_hull
+from reflfield.geometry.visual_hull import HullOptions, visual_hull
 
 COARSE = HullOptions(resolution=48, smoothing=5, n_triangles=0)
 PROPER = replace(COARSE, tolerance=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rigs
 
-from reflfield.geometry.hull import HullOptions, visual_hull
+from reflfield.geometry.visual_hull import HullOptions, visual_hull
 
 RAW = HullOptions(resolution=32, blur=0.0, smoothing=0, n_triangles=0)
 

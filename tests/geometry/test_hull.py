@@ -3,8 +3,8 @@ import pytest
 import rigs
 
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry.hull import HullOptions, visual_hull
 from reflfield.geometry.ray_scene import RayScene
+from reflfield.geometry.visual_hull import HullOptions, visual_hull
 
 RAW = HullOptions(resolution=64, tolerance=0, blur=0.0, smoothing=0, n_triangles=0)
 

@@ -11,9 +11,9 @@ import rigs
 
 from reflfield.geometry.cones import measured_views
 from reflfield.geometry.explanations import Inverted
-from reflfield.geometry.hull import HullOptions, visual_hull
-from reflfield.geometry.silhouettes import signed_distance
+from reflfield.geometry.silhouette_distance import signed_distance
 from reflfield.geometry.specks import Cleaned, without_specks
+from reflfield.geometry.visual_hull import HullOptions, visual_hull
 
 OPTIONS = HullOptions(resolution=24, smoothing=4, n_triangles=0)
 
@@ -26,8 +26,8 @@ import numpy as np
 import psutil
 import rigs
 
-from reflfield.geometry.hull import HullOptions, visual_hull
-from reflfield.stages import MemoryWatch
+from reflfield.geometry.visual_hull import HullOptions, visual_hull
+from reflfield.pipeline.cache import MemoryWatch
 
 SIZE = 1200
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry.silhouettes import signed_distance
+from reflfield.geometry.silhouette_distance import signed_distance
 
 SIZE, SUPERSAMPLING = 96, 16
 centres = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=-1)

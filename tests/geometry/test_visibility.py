@@ -5,11 +5,8 @@ import trimesh
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
-from reflfield.geometry.atlas import Atlas, AtlasOptions, build_atlas
 from reflfield.geometry.mesh import Mesh
-from reflfield.geometry.ray_scene import RayScene
-from reflfield.geometry.texels import texel_table
-from reflfield.geometry.visibility import (
+from reflfield.geometry.occlusion import (
     VisibilityOptions,
     check_light_outside,
     depth_edges,
@@ -18,6 +15,9 @@ from reflfield.geometry.visibility import (
     shadow_edge,
     view_visibility,
 )
+from reflfield.geometry.ray_scene import RayScene
+from reflfield.geometry.texels import texel_table
+from reflfield.geometry.uv_atlas import Atlas, AtlasOptions, build_atlas
 
 UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.cameras import Camera, looking_at
+from reflfield.capture.capture import Capture, Photograph
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Photograph
 from reflfield.observations.texel_samples import RootedSamples, TexelSamples
 from reflfield.sphere.hemisphere import HemisphereGrid
 

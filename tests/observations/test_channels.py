@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 from reflfield.capture.lights import Light
-from reflfield.observations import resampling
-from reflfield.observations.projection import directions_of, pairs_photographed
-from reflfield.observations.reading import LUMINANCE, NodeColumns, TexelReader, luminance_of
-from reflfield.observations.resampling import CONTINUED, ResamplingOptions, resample
+from reflfield.observations import frame_resampling
+from reflfield.observations.frame_resampling import CONTINUED, ResamplingOptions, resample
+from reflfield.observations.image_projection import directions_of, pairs_photographed
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
+from reflfield.observations.texel_reading import (
+    LUMINANCE,
+    NodeColumns,
+    TexelReader,
+    luminance_of,
+)
 from reflfield.observations.texel_samples import CHANNEL_BITS, local_directions, rooted_samples
 from reflfield.sphere.hemisphere import softened_cosine
 
@@ -124,7 +129,7 @@ def test_values_not_measured_against_a_weighted_solve(rng, monkeypatch, rounding
     measured = rng.random((2, 12, 10, 3)) < 0.8
     values = np.where(measured, whole.values, np.float32(77))
     gaps = replace(whole, values=values, channels=measured @ CHANNEL_BITS)
-    monkeypatch.setattr(resampling, "FILLING_SWEEPS", 300)
+    monkeypatch.setattr(frame_resampling, "FILLING_SWEEPS", 300)
     found = resample(gaps, (5, 5), 0.3)
     for t in range(2):
         for c in range(3):

@@ -8,16 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from reflfield.errors import ShapeError
 from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.frames import _add_texel, _gains, _own_function, improved_frames
-from reflfield.observations.projection import pairs_photographed
-from reflfield.observations.reading import TexelReader
-from reflfield.observations.resampling import ResamplingOptions
+from reflfield.field.frame_refinement import _add_texel, _gains, _own_function, improved_frames
+from reflfield.observations.frame_resampling import ResamplingOptions
+from reflfield.observations.image_projection import pairs_photographed
 from reflfield.observations.store import (
     ObservationStore,
     Observed,
     create_samples,
     open_samples,
 )
+from reflfield.observations.texel_reading import TexelReader
 from reflfield.sphere.hemisphere import HemisphereGrid, place_directions, softened_cosine
 
 from .rigs import dome, interpolated, tilted_frames
@@ -122,7 +122,7 @@ def test_texels_not_named_and_a_spread_of_nothing_keep_their_frames(planted, mod
 def test_threads_do_not_change_the_frames(planted, model, monkeypatch):
     reader, _ = planted
     one = improved_frames(reader, model, np.arange(N), SPREAD)
-    monkeypatch.setattr("reflfield.field.frames.TEXELS_AT_ONCE", 7)
+    monkeypatch.setattr("reflfield.field.frame_refinement.TEXELS_AT_ONCE", 7)
     np.testing.assert_array_equal(
         improved_frames(reader, model, np.arange(N), SPREAD, workers=3), one
     )

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera, looking_at
+from reflfield.capture.capture import Capture, Exposure, Photograph
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph
 from reflfield.errors import InputError, ShapeError
 from reflfield.observations import store
-from reflfield.observations.projection import (
+from reflfield.observations.image_projection import (
     HALF_MAX,
     USUAL_SAMPLE,
     Projection,
@@ -23,7 +23,7 @@ from reflfield.observations.projection import (
     sample_bilinear,
 )
 from reflfield.observations.store import ObservationStore, Observed
-from reflfield.scheduling import Blocks, Scheduler
+from reflfield.util.blocks import Blocks, Scheduler
 
 from .rigs import dome
 

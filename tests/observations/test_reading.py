@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from reflfield.capture.lights import Light
-from reflfield.observations.projection import pairs_photographed
-from reflfield.observations.reading import NodeColumns, TexelReader, grid_sides
-from reflfield.observations.resampling import ResamplingOptions
+from reflfield.observations.frame_resampling import ResamplingOptions
+from reflfield.observations.image_projection import pairs_photographed
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
+from reflfield.observations.texel_reading import NodeColumns, TexelReader, grid_sides
 from reflfield.observations.texel_samples import root
 from reflfield.sphere.hemisphere import HemisphereGrid
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reflfield.errors import InputError
-from reflfield.observations import resampling
-from reflfield.observations.resampling import (
+from reflfield.observations import frame_resampling
+from reflfield.observations.frame_resampling import (
     ResamplingOptions,
     apply_both,
     prior_covariance,
@@ -276,12 +276,12 @@ class TestSolve:
         smooth = np.array([[1.0, 2.0, 0.5]]) + 0.2 * rng.normal(size=(2, 12, 10, 3))
         samples = rooted(rng, 2, 12, 10, (5, 5), pairs=pairs, values=smooth.astype(np.float32))
         expected = np.stack([weighted_solution(samples, (5, 5), 0.3, t) for t in range(2)])
-        monkeypatch.setattr(resampling, "FILLING_SWEEPS", 300)
+        monkeypatch.setattr(frame_resampling, "FILLING_SWEEPS", 300)
         converged = resample(samples, (5, 5), 0.3)
         assert np.abs(converged.values - expected).max() < rounding(
             np.float32, **SOLVE, scale=3
         )
-        monkeypatch.setattr(resampling, "FILLING_SWEEPS", 4)
+        monkeypatch.setattr(frame_resampling, "FILLING_SWEEPS", 4)
         after_four = resample(samples, (5, 5), 0.3)
         # Where a pair of nodes was observed, four sweeps end within a third of what the
         # samples scatter about their mean (0.2).

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from reflfield.capture.encoding import encode_srgb
-from reflfield.comparison.residual import sample_error
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.synthetic import baked_field, blinn_phong, square_surface
-from reflfield.observations.projection import directions_of, pairs_photographed
-from reflfield.observations.reading import TexelReader
-from reflfield.observations.resampling import ResamplingOptions
+from reflfield.metrics.sample_residual import sample_error
+from reflfield.observations.frame_resampling import ResamplingOptions
+from reflfield.observations.image_projection import directions_of, pairs_photographed
 from reflfield.observations.store import (
     ObservationStore,
     Observed,
     create_samples,
     open_samples,
 )
+from reflfield.observations.texel_reading import TexelReader
 
 from .rigs import dome
 

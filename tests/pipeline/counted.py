@@ -20,11 +20,11 @@ from typing import Any
 
 from reflfield import cli
 from reflfield.observations import store
-from reflfield.scheduling import Blocks
-from reflfield.steps import columns, surface
+from reflfield.pipeline import surface, texel_columns
+from reflfield.util.blocks import Blocks
 
 store.LEAST_TEXELS_PER_CHUNK, store.CHUNK_BYTES, store.VIEWS_PER_CHUNK = 64, 1 << 10, 1
-columns.COLUMNS_AT_ONCE = 25
+texel_columns.COLUMNS_AT_ONCE = 25
 surface.DIRECTIONS_AT_ONCE = 2
 # What a block takes longer, so that a moment in the middle of one is met.
 SECONDS = 0.04

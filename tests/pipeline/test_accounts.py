@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from reflfield.capture.readers import open_capture
-from reflfield.config import HoldOut, with_tables
 from reflfield.field.file import open_field
-from reflfield.pipeline import run
-from reflfield.steps.accounts import accounts_of
-from reflfield.steps.options import PipelineOptions
+from reflfield.options import HoldOut, with_tables
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.sample_bookkeeping import accounts_of
+from reflfield.pipeline.stages import run
 
 
 @pytest.fixture

@@ -10,15 +10,15 @@ import pytest
 
 from capture_sim.scene import parse_scene
 from capture_sim.write import write_capture
-from reflfield.capture.model import PLANE
+from reflfield.capture.capture import PLANE
 from reflfield.capture.readers import open_capture
-from reflfield.config import HoldOut, merged, parse_settings, read_toml, with_tables
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
-from reflfield.pipeline import STAGES, run
-from reflfield.steps import choices
-from reflfield.steps.job import Job
-from reflfield.steps.options import PipelineOptions
+from reflfield.options import HoldOut, merged, parse_settings, read_toml, with_tables
+from reflfield.pipeline import model_selection
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.stages import STAGES, run
 
 HELD_OUT = HoldOut(views=1, lights=1)
 OPEN = ("resampling.visibility=auto", "compression.fit=auto")
@@ -33,7 +33,7 @@ SHORT = (
 KILLED_IN_A_TRIAL = """
 import os, signal
 import reflfield.cli as cli
-from reflfield.steps import evaluation
+from reflfield.pipeline import evaluation
 
 compare, done = evaluation.compare_with_photographs, []
 
@@ -274,10 +274,10 @@ def test_photographs_held_out_one_by_one_decide_too(run_open, tmp_path, tiny_cap
     used = {p.path for p in job.training.photographs}
     assert len(used) == 57
     assert used.isdisjoint(p.path for p in job.held_frames.photographs)
-    first = choices.candidates(replace(job, options=job.asked_options))[0].fit
+    first = model_selection.candidates(replace(job, options=job.asked_options))[0].fit
     second = "grid" if first == "samples" else "samples"
     ordered = {name: psnr[name] for name in (first, second)}
-    assert job.options.compression.fit == choices.clearly_best(ordered)
+    assert job.options.compression.fit == model_selection.clearly_best(ordered)
 
 
 def test_without_frames_to_compare_on_it_is_refused(run_tiny, tmp_path, tiny_capture):
@@ -303,7 +303,7 @@ class TestCandidates:
         return Job(open_capture(tiny_capture), tried, options, HELD_OUT)
 
     def names(self, job):
-        return [candidate.name for candidate in choices.candidates(job)]
+        return [candidate.name for candidate in model_selection.candidates(job)]
 
     def with_components(self, job, n_components):
         compression = replace(job.options.compression, n_components=n_components)
@@ -319,14 +319,14 @@ class TestCandidates:
         ]
 
     def test_fewer_samples_than_coefficients_are_not_fitted_to(self, job, tiny_options):
-        assert [c.fit for c in choices.candidates(self.with_components(job, 50))] == [
+        assert [c.fit for c in model_selection.candidates(self.with_components(job, 50))] == [
             "grid",
             "grid",
         ]
         fit = options_of(tiny_options, OPEN[1], "compression.n_components=50")
-        alone = choices.decided(replace(job, options=fit))
+        alone = model_selection.decided(replace(job, options=fit))
         assert alone.options.compression.fit == "grid"
-        (words,) = choices.words_of(alone)
+        (words,) = model_selection.words_of(alone)
         assert '"auto" took "grid": 5 samples per texel are fewer than coefficients.' in words
 
     def test_one_choice_has_the_names_of_its_own(self, job, tiny_options):
@@ -336,18 +336,18 @@ class TestCandidates:
         assert self.names(shadows) == ["factored", "kept"]
 
     def test_dense_samples_are_not_fitted_to(self, job, monkeypatch):
-        monkeypatch.setattr(choices, "MOST_SAMPLES", 1)
-        monkeypatch.setattr("reflfield.field.compression.MOST_SAMPLES", 1)
-        assert [c.fit for c in choices.candidates(job)] == ["grid", "grid"]
+        monkeypatch.setattr(model_selection, "MOST_SAMPLES", 1)
+        monkeypatch.setattr("reflfield.field.clustered_pca.MOST_SAMPLES", 1)
+        assert [c.fit for c in model_selection.candidates(job)] == ["grid", "grid"]
         assert self.names(job) == ["factored", "kept"]
 
     def test_shadows_that_cannot_be_traced_are_kept_without_a_trial(self, job, tiny_options):
         flat = replace(job.capture, base_geometry=PLANE)
         options = options_of(tiny_options, OPEN[0])
         plane = replace(job, capture=flat, options=options, hold_out=HoldOut())
-        choices.check_choices(plane)
-        assert not choices.is_open(plane)
-        assert choices.decided(plane).options.resampling.visibility == "kept"
+        model_selection.check_choices(plane)
+        assert not model_selection.is_open(plane)
+        assert model_selection.decided(plane).options.resampling.visibility == "kept"
 
     def test_open_shadows_are_not_taken_for_either(self, job):
         with pytest.raises(InputError, match=r"resampling.visibility.*'auto'"):
@@ -373,7 +373,7 @@ class TestCandidates:
     ],
 )
 def test_a_lead_beyond_chance_is_needed(psnr, taken):
-    assert choices.clearly_best(psnr) == taken
+    assert model_selection.clearly_best(psnr) == taken
 
 
 RIG = {

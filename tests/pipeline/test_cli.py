@@ -15,12 +15,12 @@ from rich.console import Console
 
 import reflfield as package
 import reflfield.cli as cli
-from reflfield import terminal
 from reflfield.capture.image_files import read_coverage
 from reflfield.capture.image_writing import write_exr, write_png
-from reflfield.comparison.metrics import object_pixels
 from reflfield.errors import InputError
-from reflfield.progress import ProgressLines, listening, report
+from reflfield.metrics.image_metrics import object_pixels
+from reflfield.util import terminal
+from reflfield.util.progress import ProgressLines, listening, report
 
 COMMANDS = ("demo", "run", "relight", "compare", "inspect")
 
@@ -75,7 +75,7 @@ class TestExitStatus:
         def stopped(*_, **__):
             signal.raise_signal(number)
 
-        monkeypatch.setattr("reflfield.steps.surface.visual_hull", stopped)
+        monkeypatch.setattr("reflfield.pipeline.surface.visual_hull", stopped)
         handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
         monkeypatch.setattr(signal, "getsignal", lambda number: signal.SIG_DFL)
         outcome = reflfield("run", tiny_capture, "-o", tmp_path / "out")
@@ -91,7 +91,7 @@ class TestExitStatus:
         def broken(*_, **__):
             raise KeyError("defect")
 
-        monkeypatch.setattr("reflfield.steps.surface.visual_hull", broken)
+        monkeypatch.setattr("reflfield.pipeline.surface.visual_hull", broken)
         with pytest.raises(KeyError, match="defect"):
             reflfield("run", tiny_capture, "-o", tmp_path / "out")
         assert not (tmp_path / "out" / "stages" / "hull.partial").exists()
@@ -202,9 +202,9 @@ class TestNothingIsLeftAfterAnError:
             out.mkdir(parents=True)
             (out / "metrics.json").write_text("earlier")
         fails(
-            "reflfield.relighting.frames.write_exr"
+            "reflfield.render.relit_photographs.write_exr"
             if command != "orbit"
-            else "reflfield.relighting.orbit.write_png",
+            else "reflfield.render.turntable.write_png",
             write_exr if command != "orbit" else write_png,
         )
         words = {

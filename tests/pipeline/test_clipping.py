@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture
 from reflfield.errors import InputError
-from reflfield.observations.projection import VALUE_KINDS, LookedInto, Projected
-from reflfield.steps.clipping import (
+from reflfield.observations.image_projection import VALUE_KINDS, LookedInto, Projected
+from reflfield.pipeline.clipped_values import (
     check_measured,
     clipping_lines,
     stored_measured,

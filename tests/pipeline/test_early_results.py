@@ -19,12 +19,12 @@ BARE = (
     ("function", "failure", "left"),
     [
         (
-            "reflfield.steps.evaluation.compare_with_photographs",
+            "reflfield.pipeline.comparison.compare_with_photographs",
             InputError("frame 'v005_l003': no"),
             {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr"},
         ),
         (
-            "reflfield.steps.outputs.report_content",
+            "reflfield.pipeline.outputs.report_content",
             OSError(122, "Disk quota exceeded"),
             {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
              "metrics.json"},

@@ -10,12 +10,12 @@ from reflfield.capture.image_files import read_image
 from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.readers import open_capture
-from reflfield.comparison.coverage import projected_coverage, write_frame_silhouettes
-from reflfield.comparison.metrics import object_pixels
-from reflfield.config import HoldOut
 from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.steps.holding_out import split_of
+from reflfield.metrics.comparison_silhouettes import projected_coverage, write_frame_silhouettes
+from reflfield.metrics.image_metrics import object_pixels
+from reflfield.options import HoldOut
+from reflfield.pipeline.hold_out import split_of
 
 BARE = (
     "--set", "comparison.without_alignment=false",

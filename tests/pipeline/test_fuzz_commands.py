@@ -15,7 +15,7 @@ import pytest
 
 from reflfield.field.file import write_field
 from reflfield.field.synthetic import baked_field, lambert, square_surface
-from reflfield.steps.options import PipelineOptions
+from reflfield.pipeline.pipeline_options import PipelineOptions
 
 SEED = 13
 MOST_SECONDS = 10

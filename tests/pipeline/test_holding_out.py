@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture, Exposure, Photograph
 from reflfield.capture.lights import Light
-from reflfield.capture.model import Capture, Exposure, Photograph
-from reflfield.config import HoldOut, parse_hold_out
 from reflfield.errors import InputError
-from reflfield.steps.holding_out import (
+from reflfield.options import HoldOut, parse_hold_out
+from reflfield.pipeline.hold_out import (
     held_out_words,
     left_out_words,
     split_of,

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from reflfield.capture.image_writing import write_exr
-from reflfield.checksums import checksums, first_damaged
-from reflfield.config import parse_settings, read_toml, with_tables
 from reflfield.errors import InputError
-from reflfield.folders import LOCK, only_run
-from reflfield.stages import RECORD, StageFolder
-from reflfield.steps.options import PipelineOptions
+from reflfield.options import parse_settings, read_toml, with_tables
+from reflfield.pipeline.cache import RECORD, StageFolder
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.util.checksums import checksums, first_damaged
+from reflfield.util.folders import LOCK, only_run
 
 DIGITS = "9" * 5000
 

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from reflfield import pipeline
 from reflfield.capture.readers import open_capture
-from reflfield.config import HoldOut, Resources, with_tables
-from reflfield.file_digests import FileDigests
-from reflfield.relighting.renderer import RenderOptions
-from reflfield.stages import StageFolder, StageRecord, stage_key
-from reflfield.steps.job import Job
-from reflfield.steps.options import PipelineOptions
+from reflfield.options import HoldOut, Resources, with_tables
+from reflfield.pipeline import stages
+from reflfield.pipeline.cache import StageFolder, StageRecord, stage_key
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.render.renderer import RenderOptions
+from reflfield.util.file_digests import FileDigests
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
 # All stages but the choices, which nothing leaves open here.
@@ -64,7 +64,7 @@ def keys(folder, options=OPTIONS, hold_out=None, **resources):
         Resources(**resources),
         folders=Keys(folder.parent / "out" / "stages"),
     )
-    for stage in pipeline.ORDER:
+    for stage in stages.ORDER:
         if stage.wanted(job):
             stage.run(job)
     return {record.name: record.key for record in job.stages.records}
@@ -241,7 +241,7 @@ def test_resources(capture_folder, usual, tmp_path):
 
 
 def test_trials_depend_on_no_resource():
-    stage = pipeline.BY_NAME["choices"]
+    stage = stages.BY_NAME["choices"]
     resources = RenderOptions(workers=3, block_pixels=64)
     assert stage.options(replace(OPTIONS, relighting=resources)) == stage.options(OPTIONS)
     finer = RenderOptions(samples_per_pixel=64)
@@ -250,11 +250,11 @@ def test_trials_depend_on_no_resource():
 
 def test_code(capture_folder, usual, monkeypatch):
     """A stage of code that changed, and those after it, are computed again."""
-    digests = pipeline.code_digest
+    digests = stages.code_digest
     monkeypatch.setattr(
-        pipeline,
+        stages,
         "code_digest",
-        lambda module: digests(module) + "changed" * (module == "reflfield.steps.outputs"),
+        lambda module: digests(module) + "changed" * (module == "reflfield.pipeline.outputs"),
     )
     assert changed(usual, keys(capture_folder)) == {"maps", "report"}
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from reflfield.cluster import BLOCKS_PER_THREAD
+from reflfield.util.dask_cluster import BLOCKS_PER_THREAD
 
 HERE = Path(__file__).resolve().parent
 # One work of each stage that reads or writes the samples, in their order.
@@ -27,7 +27,9 @@ WORKS = (
     "compression/coefficients on the samples, part 1",
 )
 WORKERS = 2
-COMMAND = "import counted, reflfield.cluster as c; c.WAITING_SECONDS = 12; counted.main()"
+COMMAND = (
+    "import counted, reflfield.util.dask_cluster as c; c.WAITING_SECONDS = 12; counted.main()"
+)
 
 
 class CountedRun:

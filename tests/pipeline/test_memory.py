@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 from reflfield.capture.readers import open_capture
-from reflfield.config import HoldOut, Resources, read_toml, with_tables
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
-from reflfield.observations.projection import Projection, project_photographs
-from reflfield.relighting.renderer import Renderer, RenderOptions
-from reflfield.scheduling import Blocks, Scheduler, Tally
-from reflfield.steps.columns import (
+from reflfield.observations.image_projection import Projection, project_photographs
+from reflfield.options import HoldOut, Resources, read_toml, with_tables
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.memory import check_memory, least_memory, within_memory
+from reflfield.pipeline.pipeline_options import PipelineOptions, TextureOptions
+from reflfield.pipeline.texel_columns import (
     BlockedColumns,
     Resampling,
     half_columns,
     texels_at_once,
 )
-from reflfield.steps.job import Job
-from reflfield.steps.memory import check_memory, least_memory, within_memory
-from reflfield.steps.options import PipelineOptions, TextureOptions
+from reflfield.render.renderer import Renderer, RenderOptions
+from reflfield.util.blocks import Blocks, Scheduler, Tally
 
 GB = 1 << 30
 

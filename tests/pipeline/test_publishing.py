@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from reflfield import pipeline
 from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
-from reflfield.stages import plain
-from reflfield.steps.options import PipelineOptions
-from reflfield.steps.publishing import RESULTS
+from reflfield.pipeline import stages
+from reflfield.pipeline.cache import plain
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.publishing import RESULTS
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
 SETTLED = PipelineOptions(
@@ -48,12 +48,12 @@ def capture(tmp_path):
 @pytest.fixture
 def run(monkeypatch, capture, tmp_path):
     """Function that runs the pipeline with small stages into a folder."""
-    order = tuple(small(stage) for stage in pipeline.ORDER)
-    monkeypatch.setattr(pipeline, "ORDER", order)
-    monkeypatch.setattr(pipeline, "BY_NAME", {stage.name: stage for stage in order})
+    order = tuple(small(stage) for stage in stages.ORDER)
+    monkeypatch.setattr(stages, "ORDER", order)
+    monkeypatch.setattr(stages, "BY_NAME", {stage.name: stage for stage in order})
 
     def pipeline_run(options=SETTLED, **named):
-        return pipeline.run(capture, tmp_path / "out", options, **named)
+        return stages.run(capture, tmp_path / "out", options, **named)
 
     return pipeline_run
 
@@ -129,9 +129,9 @@ def test_a_failure_after_the_field_leaves_no_earlier_report_beside_it(run, out, 
 
     order = tuple(
         replace(stage, compute=fails) if stage.name == "comparison" else stage
-        for stage in pipeline.ORDER
+        for stage in stages.ORDER
     )
-    monkeypatch.setattr(pipeline, "ORDER", order)
+    monkeypatch.setattr(stages, "ORDER", order)
     with pytest.raises(InputError, match="frames: damaged"):
         run(OTHER_ALIGNMENT)
     after = results(out)
@@ -150,9 +150,9 @@ def test_an_earlier_field_stays_until_there_is_another(run, out, monkeypatch):
 
     order = tuple(
         replace(stage, compute=fails) if stage.name == "compression" else stage
-        for stage in pipeline.ORDER
+        for stage in stages.ORDER
     )
-    monkeypatch.setattr(pipeline, "ORDER", order)
+    monkeypatch.setattr(stages, "ORDER", order)
     with pytest.raises(InputError, match="memory: full"):
         run(OTHER_HULL)
     assert results(out) == before

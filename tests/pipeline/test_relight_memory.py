@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from reflfield.capture.image_writing import write_exr
-from reflfield.config import Resources
 from reflfield.field.file import write_field
 from reflfield.field.synthetic import baked_field, lambert, sphere_surface
-from reflfield.relighting.renderer import RenderOptions
-from reflfield.steps.memory import check_picture_memory
+from reflfield.options import Resources
+from reflfield.pipeline.memory import check_picture_memory
+from reflfield.render.renderer import RenderOptions
 
 GB = 1 << 30
 

@@ -7,8 +7,8 @@ import signal
 
 import pytest
 
-from reflfield.scheduling import BlockFiles
-from reflfield.stages import StageFolder
+from reflfield.pipeline.cache import StageFolder
+from reflfield.util.blocks import BlockFiles
 
 # Runs the command; the process is killed at the step of its progress that is named.
 KILLED_AT = """

@@ -10,14 +10,14 @@ import pytest
 import trimesh
 
 from reflfield.capture.image_files import read_image
-from reflfield.config import merged
 from reflfield.field.evaluation import evaluate
 from reflfield.field.file import open_field
-from reflfield.geometry.atlas import Atlas
 from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.texels import texel_table
-from reflfield.pipeline import STAGES
-from reflfield.steps.options import PipelineOptions
+from reflfield.geometry.uv_atlas import Atlas
+from reflfield.options import merged
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.stages import STAGES
 
 # The tiny run leaves nothing open.
 RAN = tuple(stage for stage in STAGES if stage != "choices")

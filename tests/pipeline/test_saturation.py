@@ -14,12 +14,12 @@ from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_files import read_image
 from reflfield.capture.image_writing import write_png
 from reflfield.capture.readers import open_capture
-from reflfield.config import HoldOut, with_tables
 from reflfield.field.file import open_field
-from reflfield.observations import projection
-from reflfield.pipeline import run
-from reflfield.relighting.frames import relight_frames
-from reflfield.steps.options import PipelineOptions
+from reflfield.observations import image_projection
+from reflfield.options import HoldOut, with_tables
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.stages import run
+from reflfield.render.relit_photographs import relight_frames
 
 # Matt, so that what is clipped under one light is not under another.
 SCENE = {
@@ -94,9 +94,9 @@ def test_field_of_clipped_photographs_is_nearer_to_those_that_are_not(
 ):
     arguments = clipped, exposed, tiny_options
     found = error_of(*arguments, tmp_path / "left-out")
-    monkeypatch.setattr(projection, "NOT_MEASURED", ("dark",))
-    is_dark = np.array([kind == "dark" for kind in projection.VALUE_KINDS])
-    monkeypatch.setattr(projection, "IS_GAP", is_dark)
+    monkeypatch.setattr(image_projection, "NOT_MEASURED", ("dark",))
+    is_dark = np.array([kind == "dark" for kind in image_projection.VALUE_KINDS])
+    monkeypatch.setattr(image_projection, "IS_GAP", is_dark)
     counted = error_of(*arguments, tmp_path / "counted")
     print(found, counted)
     assert found < 0.9 * counted

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from reflfield.observations.store import create_samples
-from reflfield.stages import RECORD, StageFolder
+from reflfield.pipeline.cache import RECORD, StageFolder
 
 OPTIONS = {"side": 5}
 
@@ -112,7 +112,7 @@ def test_killed_before_it_takes_its_place_it_is_whole(folder, other, monkeypatch
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("reflfield.stages.take_place", killed)
+        patched.setattr("reflfield.pipeline.cache.take_place", killed)
         with pytest.raises(KeyboardInterrupt):
             folder.run("sum", refused, options=OPTIONS)
     again = StageFolder(folder.root)

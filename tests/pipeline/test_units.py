@@ -10,11 +10,11 @@ import pytest
 
 from reflfield.capture.image_files import read_image
 from reflfield.capture.readers import open_capture
-from reflfield.config import HoldOut, with_tables
 from reflfield.field.file import open_field
-from reflfield.pipeline import run
-from reflfield.relighting.frames import relight_frames
-from reflfield.steps.options import PipelineOptions
+from reflfield.options import HoldOut, with_tables
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.stages import run
+from reflfield.render.relit_photographs import relight_frames
 
 # East, north and height of a survey, metres.
 SURVEY = (4.4e5, 1e7, 2345.0)

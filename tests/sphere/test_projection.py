@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError
-from reflfield.sphere.hemisphere import HemisphereGrid
-from reflfield.sphere.projection import (
+from reflfield.sphere.harmonic_projection import (
     Projector,
     direction_operator,
     lower_gram,
     safe_band_limit,
     solid_angles,
 )
+from reflfield.sphere.hemisphere import HemisphereGrid
 
 GRID = HemisphereGrid(9).directions
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from reflfield.sphere.recombining import LANES, LINE, TILE, recombination
+from reflfield.sphere.sparse_recombination import LANES, LINE, TILE, recombination
 
 
 @pytest.mark.parametrize("n", [0, 1, LANES - 1, LANES, 2 * LANES + 3])

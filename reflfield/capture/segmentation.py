@@ -1,0 +1,311 @@
+"""Silhouettes made from photographs, where none are given.
+
+A backdrop shows at the border of the image. Where the border is of one colour (black cloth,
+a lit wall), the object is what differs from it; otherwise OpenCV's GrabCut separates what
+the border shows from the rest. Both work on the mean of a view's photographs: a part in
+shadow under one light is lit under another, and noise averages out.
+
+A silhouette that misses part of the object carves that part off the hull for good, one that
+is a little too large does not: dark parts in doubt are kept, small holes are filled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.encoding import encode_srgb
+from reflfield.errors import CaptureError, InputError
+from reflfield.util.validation import check_shape
+
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SilhouetteOptions:
+    """How silhouettes are made. Lengths are fractions of the longer image side.
+
+    Parameters
+    ----------
+    border : float
+        Width of the frame whose pixels stand for the backdrop.
+    uniform_spread : float
+        The backdrop counts as uniform if three quarters of the border differ from its
+        median colour by less than this (sRGB-encoded, in [0, 1]); the object may cross the
+        rest.
+    least_contrast : float
+        Difference from the backdrop (encoded) below which nothing is object.
+    margin : float
+        Distance from what is certainly object beyond which all is backdrop.
+    crack : float
+        Gaps up to this width do not part the object.
+    closing : float
+        Notches in the outline up to this width are filled: mostly parts in cast shadow, as
+        dark as the backdrop. Holes are left as they are.
+    smallest_part, smallest_hole : float
+        Parts and holes with a smaller share of the object's area are dropped and filled.
+    soft_edge : float
+        Width of the band beside the outline in which coverage may lie between 0 and 1.
+    grabcut_iterations : int
+        Iterations of GrabCut.
+    grabcut_size : int
+        GrabCut works on an image with at most this longer side, pixels.
+    """
+
+    border: float = 0.015
+    uniform_spread: float = 0.25
+    least_contrast: float = 0.02
+    margin: float = 0.015
+    crack: float = 0.02
+    closing: float = 0.036
+    smallest_part: float = 0.05
+    smallest_hole: float = 0.015
+    soft_edge: float = 0.003
+    grabcut_iterations: int = 6
+    grabcut_size: int = 512
+
+
+def silhouette_from_photographs(
+    photographs: Iterable[Float32],
+    options: SilhouetteOptions | None = None,
+    *,
+    name: str = "view",
+) -> Float32:
+    """Coverage of the object in the photographs of one view.
+
+    Parameters
+    ----------
+    photographs : iterable of (h, w, 3) float32
+        Linear photographs of one view, one per light; taken one at a time.
+    options : SilhouetteOptions, optional
+        Thresholds.
+    name : str
+        Named in errors.
+
+    Returns
+    -------
+    (h, w) float32
+        Coverage in [0, 1], anti-aliased along the outline.
+
+    Raises
+    ------
+    CaptureError
+        If no object is found.
+    InputError
+        If there are no photographs, they are not (h, w, 3), or their sizes differ.
+
+    Examples
+    --------
+    A bright square on black:
+
+    >>> photograph = np.zeros((40, 40, 3), np.float32)
+    >>> photograph[10:30, 10:30] = 0.5
+    >>> coverage = silhouette_from_photographs([photograph])
+    >>> round(float(coverage.sum()))
+    400
+    """
+    options = options or SilhouetteOptions()
+    image = _exposed(_mean(photographs, name))
+    encoded = encode_srgb(image)
+    border = _border(image.shape[0], image.shape[1], options.border)
+    backdrop = np.median(encoded[border], axis=0)
+    difference = np.abs(encoded - backdrop).max(axis=2)
+    uniform = np.quantile(difference[border], 0.75) < options.uniform_spread
+    if uniform:
+        inside = _differs_from_backdrop(difference, border, options)
+    else:
+        inside = _grabcut(encoded, border, options)
+    seen, inside = inside, _cleaned(inside, options)
+    share = float(inside.mean())
+    if not 0.0005 < share < 0.995:
+        raise CaptureError(
+            f"{name}: expected an object before a backdrop, found one that covers "
+            f"{100 * share:.2f} % of the image: empty silhouette; give a silhouette per view"
+        )
+    if not uniform:
+        return _smoothed(inside)
+    linear_backdrop = np.median(image[border], axis=0)
+    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), seen, inside, options)
+
+
+def _mean(photographs: Iterable[Float32], name: str) -> Float32:
+    """Mean of the photographs, one in memory at a time."""
+    total, count = None, 0
+    for photograph in photographs:
+        check_shape(f"{name}: photograph", photograph, (None, None, 3))
+        if total is not None and total.shape != photograph.shape:
+            raise InputError(
+                f"{name}: expected photographs of one size, received {total.shape} and "
+                f"{photograph.shape}"
+            )
+        total = photograph.astype(np.float64) if total is None else total + photograph
+        count += 1
+    if total is None:
+        raise InputError(f"{name}: expected photographs or a silhouette file, received neither")
+    return (total / count).astype(np.float32)
+
+
+def _exposed(image: Float32) -> Float32:
+    """Scaled so that its brightest pixels, outliers aside, are 1."""
+    white = float(np.quantile(image.max(axis=2), 0.995))
+    return image / np.float32(white) if white > 0 else image
+
+
+def _border(height: int, width: int, fraction: float) -> Bool:
+    """True in a frame along the edge of the image."""
+    n = max(2, round(fraction * max(height, width)))
+    border = np.ones((height, width), dtype=bool)
+    border[n:-n, n:-n] = False
+    return border
+
+
+def _differs_from_backdrop(
+    difference: Float32, border: Bool, options: SilhouetteOptions
+) -> Bool:
+    """Pixels that differ from the backdrop, or differ a little and are near such ones.
+
+    Both thresholds follow what the backdrop itself varies by; the upper one is at most
+    Otsu's, which splits the image's two levels.
+    """
+    n = max(3, round(options.margin * max(difference.shape)))
+    levels = np.clip(difference * 255, 0, 255).astype(np.uint8)
+    otsu = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0] / 255
+    bright = (difference > max(otsu, options.least_contrast)).astype(np.uint8)
+    far = cv2.dilate(bright, _disc(n)) == 0
+    variation = _variation(difference, border, far)
+    strong = float(np.clip(3 * variation, 2 * options.least_contrast, max(otsu, 0.1)))
+    weak = float(np.clip(1.25 * variation, options.least_contrast, 0.75 * strong))
+    smooth = cv2.GaussianBlur(difference, (0, 0), 0.7)
+    near = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
+    return _touching((smooth > weak) & near, smooth > strong)
+
+
+def _variation(difference: Float32, border: Bool, far: Bool) -> float:
+    """How far the backdrop strays from its median colour.
+
+    Seen far from the bright pixels, where dark parts of the object may hide, and in the
+    border, which the object may cross: the smaller of both, and the border is farther from
+    the light that the object scatters.
+    """
+    in_border = 2.5 * float(np.quantile(difference[border], 0.95)) + 1 / 255
+    return min(in_border, float(np.quantile(difference[far], 0.99)) if far.any() else 0.0)
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    element: NDArray[np.uint8] = cv2.getStructuringElement(
+        cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)
+    )
+    return element
+
+
+def _touching(candidates: Bool, seeds: Bool) -> Bool:
+    """Connected parts of `candidates` that hold a seed."""
+    _, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=4)
+    kept = np.zeros(labels.max() + 1, dtype=bool)
+    kept[np.unique(labels[seeds & candidates])] = True
+    kept[0] = False
+    return kept[labels]
+
+
+def _grabcut(encoded: Float32, border: Bool, options: SilhouetteOptions) -> Bool:
+    """Object by GrabCut, seeded with the border as backdrop."""
+    height, width = border.shape
+    scale = min(1.0, options.grabcut_size / max(height, width))
+    size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    small = cv2.resize((encoded * 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+    labels = np.full(small.shape[:2], cv2.GC_PR_FGD, dtype=np.uint8)
+    labels[_border(size[1], size[0], max(options.border, 0.03))] = cv2.GC_BGD
+    cv2.setRNGSeed(0)  # its k-means draws from OpenCV's global generator
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(small, labels, None, *models, options.grabcut_iterations, cv2.GC_INIT_WITH_MASK)
+    inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.float32)
+    return cv2.resize(inside, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+def _cleaned(inside: Bool, options: SilhouetteOptions) -> Bool:
+    """Gaps closed, crumbs dropped, small holes filled; large holes keep their shape."""
+    longer = max(inside.shape)
+    joined = _closed(inside, max(1, round(options.crack * longer / 2)))
+    parts = _large_parts(joined, options.smallest_part)
+    solid = ~_large_holes(~parts, float("inf"))
+    least = options.smallest_hole * float(parts.sum())
+    holes = _large_holes(solid & ~parts, least)
+    bridged = _closed(solid, max(1, round(options.closing * longer / 2)))
+    return ~_large_holes(~bridged, least) & ~holes
+
+
+def _closed(inside: Bool, radius: int) -> Bool:
+    """Morphological closing; the object continues beyond the border of the image."""
+    padded = np.pad(inside.astype(np.uint8), 2 * radius, mode="edge")
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(radius))
+    return closed[2 * radius : -2 * radius, 2 * radius : -2 * radius] > 0
+
+
+def _large_parts(inside: Bool, smallest_share: float) -> Bool:
+    """Connected parts whose area is at least a share of the largest one's."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        inside.astype(np.uint8), connectivity=8
+    )
+    if count == 1:
+        return inside
+    area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    area[0] = 0
+    kept: Bool = area >= max(smallest_share * area.max(), 1)
+    return kept[labels]
+
+
+def _large_holes(outside: Bool, smallest_area: float) -> Bool:
+    """The outside without holes smaller than an area; what touches the border stays."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        outside.astype(np.uint8), connectivity=4
+    )
+    kept: Bool = stats[:, cv2.CC_STAT_AREA] >= smallest_area
+    edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    kept[edge] = True
+    kept[0] = False  # label 0 is the object itself
+    return kept[labels]
+
+
+def _smoothed(inside: Bool) -> Float32:
+    """Coverage of an outline that is only known to the pixel."""
+    return np.clip(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.8), 0, 1)
+
+
+def _soft_edged(
+    difference: Float32, seen: Bool, inside: Bool, options: SilhouetteOptions
+) -> Float32:
+    r"""Coverage along the outline, from how far each pixel is on its way to the object.
+
+    A pixel that the object covers by :math:`\alpha` differs from the backdrop by
+    :math:`\alpha` times what the object does, in linear light. The object's own difference
+    is taken from just inside the outline. Where the object itself is dark there, or was
+    filled in without being seen, the ratio means nothing and the plain outline is kept.
+    """
+    n = max(2, round(options.soft_edge * max(inside.shape)))
+    disc = _disc(n)
+    solid = inside.astype(np.uint8)
+    padded = cv2.copyMakeBorder(solid, n, n, n, n, cv2.BORDER_REPLICATE)
+    core = cv2.erode(padded, disc)[n:-n, n:-n] > 0
+    reach = _disc(2 * n).astype(np.float32)
+    weight = cv2.filter2D(core.astype(np.float32), -1, reach)
+    total = cv2.filter2D(np.where(core, difference, 0), -1, reach)
+    object_difference = total / np.maximum(weight, 1)
+    filled = cv2.dilate((inside & ~seen).astype(np.uint8), _disc(1)) > 0
+    trusted = (weight >= 1) & (object_difference > 0.02) & ~filled
+    ratio = np.clip(difference / np.maximum(object_difference, 1e-6), 0, 1)
+    band = (cv2.dilate(solid, disc) > 0) & ~core
+    soft = np.where(band & trusted, ratio, _smoothed(inside)).astype(np.float32)
+    return _without_specks(soft, options)
+
+
+def _without_specks(coverage: Float32, options: SilhouetteOptions) -> Float32:
+    """Coverage without the single pixels that a ratio of dark values leaves behind."""
+    solid = coverage > 0.5
+    parts = _large_parts(solid, options.smallest_part)
+    clean = ~_large_holes(~parts, options.smallest_hole * float(parts.sum()))
+    return np.where(clean == solid, coverage, clean).astype(np.float32)

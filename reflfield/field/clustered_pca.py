@@ -1,0 +1,219 @@
+"""From completed texels to clusters with mean and basis: clustered local PCA.
+
+The columns are already of low rank after completion, so clusters and their bases are
+found among the completion's coefficients (a few numbers a texel) and lifted; the
+result is that of local PCA on the completed columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reflfield.errors import InputError
+from reflfield.factorization import Completion, LocalPCA
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.fit import SampleFitOptions
+from reflfield.util.validation import check_ranges
+
+Floats = NDArray[np.float32]
+
+# Samples that a texel must have on average for each coefficient to be fitted to them.
+SAMPLES_PER_COEFFICIENT = 4
+# Samples of a texel, on average, above which the grids are dense enough.
+MOST_SAMPLES = 4096
+
+# Noise and coefficients have at least this share of the largest variance of a coefficient.
+LEAST_SPREAD = 1e-9
+
+
+@dataclass(frozen=True)
+class CompressionOptions:
+    """Size of the field and how it is fitted.
+
+    Parameters
+    ----------
+    n_clusters, n_components : int
+        Clusters, and basis functions of each beside its mean.
+    fit : {"auto", "samples", "grid"}
+        "grid": local PCA of the resampled texels, as in the paper. "samples": from there,
+        mean, basis and coefficients are fitted to the samples themselves. "auto" makes
+        both fields and takes the one that is clearly better on the held-out frames. Without
+        any, in doubt, or where a texel has fewer samples than coefficients or thousands of
+        them, their number decides: see `fits_samples`.
+    rank : int
+        Rank of the completion in the aligned frames.
+    training_texels : int
+        Texels that shape the completion's basis.
+    samples : SampleFitOptions
+    size : int
+        Bytes that the file may have, 0: as many as `coarseness` gives. Clusters, components
+        and quantisation are then chosen by the error that they leave; see `field.rate`.
+    psnr : float
+        LDR PSNR, dB, that the field is to have on the samples that it is made of, 0: as it
+        comes. Clusters, components and quantisation are then chosen for the smallest file.
+    coarseness : float
+        Quantisation step of the field over the root mean square residual of the fit. At a
+        half, quantisation adds some percent to the error; see `Quantisation`.
+    """
+
+    n_clusters: int = 8
+    n_components: int = 6
+    fit: str = "auto"
+    rank: int = 16
+    training_texels: int = 8192
+    samples: SampleFitOptions = field(default_factory=SampleFitOptions)
+    size: int = 0
+    psnr: float = 0.0
+    coarseness: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.fit not in ("auto", "samples", "grid"):
+            raise InputError(
+                f"fit: expected 'auto', 'samples' or 'grid', received {self.fit!r}"
+            )
+        for name, least, most in (
+            ("n_clusters", 1, 65_536),
+            ("n_components", 0, 1024),
+            ("rank", 1, 1024),
+            ("training_texels", 1, 1 << 24),
+            ("size", 0, 1 << 40),
+        ):
+            if not least <= getattr(self, name) <= most:
+                raise InputError(
+                    f"{name}: expected at least {least} and at most {most}, "
+                    f"received {getattr(self, name)}"
+                )
+        if not 0 <= self.psnr < float("inf"):
+            raise InputError(f"psnr: expected >= 0 dB, received {self.psnr}")
+        if self.size and self.psnr:
+            raise InputError(
+                f"size, psnr: expected one of them, received {self.size} bytes and "
+                f"{self.psnr} dB"
+            )
+        check_ranges(self, {"coarseness": (1e-3, 1e3)})
+
+    def fits_samples(self, n_samples: float) -> bool:
+        """Whether to fit to the samples, of which a texel has `n_samples` on average.
+
+        With a few samples a texel, its coefficients would follow their errors; on dense
+        domes the grids lose little and the samples of enough texels do not fit in memory.
+        """
+        enough = SAMPLES_PER_COEFFICIENT * self.n_components
+        return self.fit == "samples" or (
+            self.fit == "auto" and enough <= n_samples <= MOST_SAMPLES
+        )
+
+
+def cluster_completed(
+    completion: Completion,
+    coefficients: Floats,
+    observed: NDArray[np.intp],
+    node_counts: tuple[int, int],
+    options: CompressionOptions,
+    seed: int = 0,
+) -> ClusteredModel:
+    """Local PCA of completed texels.
+
+    Parameters
+    ----------
+    completion : Completion
+        Basis and mean of the columns; rows are (view node, light node, channel).
+    coefficients : (n_texels, rank) float32
+        Of all texels, about the mean.
+    observed : (k,) int
+        Texels that have samples; the others get cluster 0 and zero coefficients.
+    node_counts : (int, int)
+        View and light nodes.
+    options : CompressionOptions
+    seed : int
+
+    Returns
+    -------
+    ClusteredModel
+        With a prior from the spread of each cluster's coefficients.
+    """
+    n_components = min(options.n_components, completion.rank)
+    local = LocalPCA(options.n_clusters, n_components, seed=seed).fit(
+        np.ascontiguousarray(coefficients[observed].T)
+    )
+    means = completion.mean + local.means @ completion.basis.T
+    bases = completion.basis @ local.bases  # (n_clusters, n_rows, K)
+    table = np.concatenate([means[:, :, None], bases], axis=2)
+    table = table.reshape(len(means), *node_counts, 3, n_components + 1)
+    table = np.swapaxes(table, 3, 4).reshape(len(means), *node_counts, -1)
+    # Of the coefficients in an orthonormal basis; here per row of the columns.
+    left_out = local.residual**2 * completion.rank / len(completion.mean)
+    model = ClusteredModel(
+        cluster=np.zeros(len(coefficients), np.int32),
+        coefficients=np.zeros((len(coefficients), n_components), np.float32),
+        table=np.ascontiguousarray(table, np.float32),
+        precision=_precision(
+            local.labels, local.coefficients, completion.noise, local.n_clusters
+        ),
+        residuals=(float(np.sqrt(left_out + completion.noise**2)),),
+    )
+    model.cluster[observed] = local.labels
+    model.coefficients[observed] = local.coefficients
+    return model
+
+
+def _precision(
+    labels: NDArray[np.int32],
+    coefficients: NDArray[np.floating],
+    noise: float,
+    n_clusters: int,
+) -> NDArray[np.float64]:
+    """Noise variance over the variance of each coefficient in each cluster.
+
+    Both are floored relative to the spread of all coefficients, so that the unit of the
+    data does not matter; a cluster without spread gets the floor, its coefficients zero.
+    """
+    n_components = coefficients.shape[1]
+    precision = np.tile(np.eye(n_components), (n_clusters, 1, 1))
+    spread = float(coefficients.astype(np.float64).var(axis=0).max(initial=0.0))
+    least = max(LEAST_SPREAD * spread, np.finfo(np.float64).tiny)
+    for cluster in np.unique(labels):
+        variance = coefficients[labels == cluster].astype(np.float64).var(axis=0)
+        floor = max(1e-6 * variance.max(initial=0.0), least)
+        ratio = max(noise**2, least) / np.maximum(variance, floor)
+        np.fill_diagonal(precision[cluster], ratio)
+    return precision
+
+
+def fill_unobserved(
+    model: ClusteredModel, positions: NDArray[np.floating], observed: NDArray[np.intp]
+) -> ClusteredModel:
+    """Give texels without samples cluster and coefficients of the nearest that has some.
+
+    Parameters
+    ----------
+    model : ClusteredModel
+    positions : (n_texels, 3) float
+        Metres.
+    observed : (k,) int
+        Texels that have samples.
+
+    Returns
+    -------
+    ClusteredModel
+        The model itself if every texel has samples.
+
+    Raises
+    ------
+    InputError
+        If no texel has samples.
+    """
+    if not len(observed):
+        raise InputError("observed: expected texels with samples, received none")
+    empty = np.setdiff1d(np.arange(len(positions)), observed)
+    if not len(empty):
+        return model
+    _, nearest = cKDTree(positions[observed]).query(positions[empty])
+    cluster, coefficients = model.cluster.copy(), model.coefficients.copy()
+    cluster[empty] = cluster[observed[nearest]]
+    coefficients[empty] = coefficients[observed[nearest]]
+    return replace(model, cluster=cluster, coefficients=coefficients)

@@ -1,0 +1,328 @@
+"""What each texel sees: occlusion towards cameras and lights by ray tracing.
+
+Near cameras and near lights are points: every texel has its own ray to them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from reflfield.capture.cameras import Camera
+from reflfield.capture.lights import Light
+from reflfield.errors import InputError
+from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.ray_scene import RayScene, row_strips
+from reflfield.geometry.texels import TexelTable
+from reflfield.util.validation import check_ranges, check_shape
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# Pixels, and a share of the object's diagonal.
+_RANGES = {
+    "edge_band": (0, 1e6),
+    "edge_slope": (0, 1e6),
+    "shadow_band": (0, 1e6),
+    "ray_offset": (0, 0.1),
+}
+# Lights that come from everywhere or from nowhere known: no single ray can miss them.
+_WITHOUT_DIRECTION = ("environment", "unknown")
+
+
+@dataclass(frozen=True)
+class VisibilityOptions:
+    """When a texel counts as seen and as lit.
+
+    Parameters
+    ----------
+    grazing_cosine : float
+        Views whose angle to the smooth normal has a smaller cosine are rejected: a pixel
+        there covers many texels.
+    light_cosine : float
+        Lights at or below this cosine over the smooth normal do not light the texel.
+    edge_band : float
+        Rejected distance from depth discontinuities in the photograph, pixels.
+    edge_slope : float
+        Neighbouring pixels whose depths differ by more than this many pixel footprints
+        are a discontinuity. At the grazing limit .15 a plane differs by 6.6 footprints.
+    ray_offset : float
+        Start of the rays above the surface, in diagonals of the mesh's bounding box.
+    coverage : float
+        Least coverage of a pixel by the silhouette, where one is given.
+    shadow_band : float
+        Distance from a shadow's boundary that `shadow_edge` reports, texel spacings.
+    """
+
+    grazing_cosine: float = 0.15
+    light_cosine: float = 0.0
+    edge_band: float = 1.5
+    edge_slope: float = 10.0
+    ray_offset: float = 2e-4
+    coverage: float = 0.5
+    shadow_band: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("grazing_cosine", "light_cosine", "coverage"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise InputError(
+                    f"{name}: expected a number in [0, 1), received {getattr(self, name)}"
+                )
+        check_ranges(self, _RANGES)
+
+
+def lifted_positions(texels: TexelTable, scene: RayScene, options: VisibilityOptions) -> Array:
+    """Texel positions raised off the surface by the ray offset, (n, 3) float64."""
+    lift = options.ray_offset * scene.diagonal
+    return texels.position + lift * texels.face_normal
+
+
+def view_visibility(
+    texels: TexelTable,
+    scene: RayScene,
+    camera: Camera,
+    options: VisibilityOptions | None = None,
+    edges: Bools | None = None,
+    silhouette: NDArray[np.floating] | Bools | None = None,
+) -> Bools:
+    """Which texels a camera sees well enough to sample its photograph.
+
+    A texel is visible when it projects into the frame, is not seen at a grazing
+    angle, nothing blocks the ray to the camera, no depth discontinuity lies
+    within `edge_band` pixels of it in the photograph, and the photograph's
+    silhouette, if given, covers its pixel.
+
+    Parameters
+    ----------
+    texels : TexelTable
+    scene : RayScene
+        Of the mesh the texels lie on.
+    camera : Camera
+    options : VisibilityOptions, optional
+    edges : (height, width) bool, optional
+        Result of `depth_edges` for this camera, to share it between blocks of texels.
+    silhouette : (height, width) float or bool, optional
+        Coverage of the object in [0, 1]; texels on pixels below `coverage` are not seen.
+        Of use where the base geometry is larger than the object, as an image plane is.
+
+    Returns
+    -------
+    (n,) bool
+
+    Raises
+    ------
+    ShapeError
+        If `edges` or `silhouette` has another size than the camera's images.
+    """
+    options = options or VisibilityOptions()
+    usable = np.ones((camera.height, camera.width), dtype=bool)
+    if silhouette is not None:
+        check_shape("silhouette", silhouette, usable.shape)
+        usable &= silhouette >= options.coverage
+    if options.edge_band > 0.0:
+        edges = depth_edges(scene, camera, options) if edges is None else edges
+        check_shape("edges", edges, usable.shape)
+        usable &= ~edges
+    visible = _faces_camera(texels, camera, options)
+    visible &= _on_usable_pixel(texels, camera, usable)
+    seen = np.flatnonzero(visible)
+    starts = lifted_positions(texels.subset(seen), scene, options)
+    visible[seen] = ~scene.occluded(
+        starts, camera.view_directions(starts), _camera_distances(camera, starts)
+    )
+    return visible
+
+
+def depth_edges(scene: RayScene, camera: Camera, options: VisibilityOptions) -> Bools:
+    """Pixels within `edge_band` of a depth discontinuity, (height, width) bool.
+
+    A discontinuity lies between two neighbouring pixels if only one of them hits
+    the surface, or their depths differ by more than `edge_slope` footprints.
+
+    Examples
+    --------
+    >>> square = Mesh([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], [[0, 2, 1], [0, 3, 2]])
+    >>> pose = np.eye(4)
+    >>> pose[2, 3] = 1.0
+    >>> camera = Camera("v", "orthographic", 6, 1, 1.0, 1.0, 0.0, 0.0, pose)
+    >>> depth_edges(RayScene(square), camera, VisibilityOptions(edge_band=1.0))
+    array([[False, False, False,  True,  True, False]])
+    """
+    reach = math.ceil(options.edge_band) + 1
+    edges = np.zeros((camera.height, camera.width), dtype=bool)
+    for first, end in row_strips(camera):
+        low, high = max(first - reach, 0), min(end + reach, camera.height)
+        strip = _edges_of_rows(scene, camera, options, low, high)
+        edges[first:end] = strip[first - low : end - low]
+    return edges
+
+
+def _edges_of_rows(
+    scene: RayScene, camera: Camera, options: VisibilityOptions, first: int, end: int
+) -> Bools:
+    """`depth_edges` of some rows, which alone are looked at."""
+    depth = scene.row_depths(camera, first, end)
+    footprint = _footprint(camera, depth)
+    across, down = _jumps(depth, footprint, options), _jumps(depth.T, footprint.T, options)
+    beside = np.zeros(depth.shape, dtype=bool)
+    beside[:, 1:] |= across
+    beside[:, :-1] |= across
+    beside[1:] |= down.T
+    beside[:-1] |= down.T
+    if not beside.any():
+        return beside
+    # The centres of the two pixels beside an edge are half a pixel away from it.
+    return np.asarray(ndimage.distance_transform_edt(~beside) + 0.5 <= options.edge_band)
+
+
+def light_visibility(
+    texels: TexelTable,
+    scene: RayScene,
+    light: Light,
+    options: VisibilityOptions | None = None,
+) -> Bools:
+    """Which texels a light reaches: above the horizon and not shadowed by the mesh.
+
+    Parameters
+    ----------
+    texels : TexelTable
+    scene : RayScene
+        Of the mesh the texels lie on.
+    light : Light
+        Environment and unknown lights reach every texel.
+    options : VisibilityOptions, optional
+
+    Returns
+    -------
+    (n,) bool
+    """
+    options = options or VisibilityOptions()
+    if light.kind in _WITHOUT_DIRECTION:
+        return np.ones(len(texels), dtype=bool)
+    lit = _faces_light(texels, light, options)
+    rows = np.flatnonzero(lit)
+    starts = lifted_positions(texels.subset(rows), scene, options)
+    lit[rows] = ~scene.occluded(starts, light.directions(starts), light.distances(starts))
+    return lit
+
+
+def shadow_edge(
+    texels: TexelTable,
+    scene: RayScene,
+    light: Light,
+    options: VisibilityOptions | None = None,
+    n_rays: int = 8,
+) -> Bools:
+    """Texels so near the boundary of a cast shadow that the geometry's error decides.
+
+    Rays start on a ring of radius `shadow_band` texel spacings around the texel, in its
+    tangent plane and a quarter of the radius above it (concave surfaces down to twice the
+    radius stay below it). The texel is on an edge where some are blocked and some not.
+    Where the surface turns away from the light no edge is reported: the cosine is zero there.
+
+    Parameters
+    ----------
+    texels, scene, light, options
+        As in `light_visibility`.
+    n_rays : int
+        Rays of the ring.
+
+    Returns
+    -------
+    (n,) bool
+    """
+    options = options or VisibilityOptions()
+    on_edge = np.zeros(len(texels), dtype=bool)
+    if light.kind in _WITHOUT_DIRECTION:
+        return on_edge
+    rows = np.flatnonzero(_faces_light(texels, light, options))
+    ring = texels.subset(rows)
+    centre = lifted_positions(ring, scene, options)
+    tangent, binormal, normal = np.moveaxis(ring.local_from_world.astype(np.float64), 1, 0)
+    radius = options.shadow_band * texels.spacing
+    n_blocked = np.zeros(len(rows), dtype=np.int64)
+    for angle in 2.0 * np.pi * np.arange(n_rays) / n_rays:
+        shift = np.cos(angle) * tangent + np.sin(angle) * binormal + 0.25 * normal
+        starts = centre + radius * shift
+        n_blocked += scene.occluded(starts, light.directions(starts), light.distances(starts))
+    on_edge[rows] = (n_blocked > 0) & (n_blocked < n_rays)
+    return on_edge
+
+
+def check_light_outside(scene: RayScene, light: Light) -> None:
+    """Refuse a light that stands inside the object.
+
+    Raises
+    ------
+    InputError
+        Naming the light.
+    """
+    if light.kind in ("point", "spot") and scene.inside(light.position[None])[0]:
+        raise InputError(
+            f"light {light.id!r}: expected a position outside the object, received "
+            f"{np.round(light.position, 4).tolist()} inside its hull; check the light's "
+            "position, its units (metres) and its frame"
+        )
+
+
+def light_inside(mesh: Mesh, position: ArrayLike) -> bool:
+    """Return True if a position (3,) lies inside a watertight mesh."""
+    return bool(RayScene(mesh).inside(np.asarray(position, dtype=np.float64)[None])[0])
+
+
+def _faces_camera(texels: TexelTable, camera: Camera, options: VisibilityOptions) -> Bools:
+    """True where the camera is in front of both the smooth and the real surface."""
+    towards = camera.view_directions(texels.position)
+    cosine = (towards * texels.normal).sum(axis=1)
+    return (cosine >= options.grazing_cosine) & ((towards * texels.face_normal).sum(axis=1) > 0)
+
+
+def _on_usable_pixel(texels: TexelTable, camera: Camera, usable: Bools) -> Bools:
+    """True where a texel projects into the frame, onto a pixel that may be sampled."""
+    pixels, depth = camera.project(texels.position)
+    in_front = (depth > 0.0) | (camera.kind == "orthographic")
+    in_frame = np.flatnonzero(in_front & _contains(camera, pixels))
+    col, row = np.floor(pixels[in_frame]).astype(np.int64).T
+    found = np.zeros(len(texels), dtype=bool)
+    found[in_frame] = usable[row, col]
+    return found
+
+
+def _contains(camera: Camera, pixels: Array) -> Bools:
+    """True inside the frame, its right and lower border excluded; False for NaN."""
+    u, v = pixels.T
+    return (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
+
+
+def _faces_light(texels: TexelTable, light: Light, options: VisibilityOptions) -> Bools:
+    cosine = (light.directions(texels.position) * texels.normal).sum(axis=1)
+    return cosine > options.light_cosine
+
+
+def _camera_distances(camera: Camera, points: Array) -> Array:
+    if camera.kind == "orthographic":
+        return np.full(len(points), np.inf)
+    return np.linalg.norm(camera.centre - points, axis=1)
+
+
+def _footprint(camera: Camera, depth: Array) -> Array:
+    """Width of a pixel at the depth of the surface, metres."""
+    focal = min(camera.fl_x, camera.fl_y)
+    if camera.kind == "orthographic":
+        return np.full(depth.shape, 1.0 / focal)
+    return depth / focal
+
+
+def _jumps(depth: Array, footprint: Array, options: VisibilityOptions) -> Bools:
+    """True between horizontal neighbours of very different depth, (h, w - 1)."""
+    left, right = depth[:, :-1], depth[:, 1:]
+    one_misses = np.isfinite(left) != np.isfinite(right)
+    both_hit = np.isfinite(left) & np.isfinite(right)
+    step = np.abs(np.subtract(left, right, out=np.zeros_like(left), where=both_hit))
+    nearer = np.minimum(footprint[:, :-1], footprint[:, 1:])
+    limit = options.edge_slope * np.where(both_hit, nearer, 0.0)
+    return one_misses | (both_hit & (step > limit))

@@ -1,0 +1,119 @@
+"""Photographs beside what a field predicts for them: relit, read back, measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from reflfield.capture.capture import Capture
+from reflfield.capture.image_files import read_image
+from reflfield.errors import NumericalError
+from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.metrics.comparison_silhouettes import FrameSilhouettes
+from reflfield.metrics.image_metrics import Comparison, FramePair, compare_frames
+from reflfield.render.relit_photographs import relight_frames
+from reflfield.render.renderer import RenderOptions
+
+
+@dataclass(frozen=True, eq=False)
+class RelitPairs:
+    """Frames with their relit pictures on disk; may be iterated any number of times.
+
+    Parameters
+    ----------
+    frames : Capture
+        Photographs.
+    folder : Path
+        Holds NAME.exr of every frame.
+    silhouettes : FrameSilhouettes
+        Of the views of the frames.
+    """
+
+    frames: Capture
+    folder: Path
+    silhouettes: FrameSilhouettes
+
+    def __len__(self) -> int:
+        return len(self.frames.photographs)
+
+    def __iter__(self) -> Iterator[FramePair]:
+        for i, photograph in enumerate(self.frames.photographs):
+            radiance, measured = self.frames.read_measured(i)
+            yield FramePair(
+                name=photograph.name,
+                photograph=radiance,
+                relit=read_image(self.folder / f"{photograph.name}.exr"),
+                silhouette=self.silhouettes.read(photograph.camera),
+                # What is too dark to measure is as good as black; what is too bright is not.
+                excluded=np.any(~measured & (radiance > 0), axis=-1, keepdims=True)[..., 0],
+                silhouette_from=self.silhouettes.origins[photograph.camera],
+            )
+
+    def measured_in(self, comparison: Comparison) -> RelitPairs:
+        """Those frames alone that a comparison of them has measured."""
+        names = {frame.name for frame in comparison.frames}
+        kept = tuple(p for p in self.frames.photographs if p.name in names)
+        return replace(self, frames=replace(self.frames, photographs=kept))
+
+
+def compare_with_photographs(
+    field: ReflectanceField,
+    frames: Capture,
+    silhouettes: FrameSilhouettes,
+    folder: Path,
+    options: RenderOptions | None = None,
+) -> Comparison:
+    """Relight frames into a folder and measure them against their photographs.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    frames : Capture
+        Cameras, lights, photographs.
+    silhouettes : FrameSilhouettes
+        Of the views of the frames.
+    folder : Path
+        Gets NAME.exr and NAME.png of every frame.
+    options : RenderOptions, optional
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If there is no frame, or none that can be measured.
+    NumericalError
+        If what the field shows is not finite.
+    """
+    for frame in relight_frames(field, frames, folder, options):
+        if not np.isfinite(frame.rendering.image).all():
+            raise NumericalError(
+                f"frame {frame.name!r}: expected finite radiance of the field, received "
+                "NaN or infinity: its values are too large; make the field again"
+            )
+    return compare_frames(RelitPairs(frames, folder, silhouettes))
+
+
+def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """Mean over observed samples, NaN where there is none.
+
+    Parameters
+    ----------
+    values : (n, n_views, n_lights, 3) float
+        NaN where a channel was not measured.
+    observed : (n, n_views, n_lights) bool
+
+    Returns
+    -------
+    (n, 3) float
+    """
+    measured = ~np.isnan(values)
+    counted = observed.astype(np.float32)
+    weight = np.einsum("nvlc,nvl->nc", measured.astype(np.float32), counted)
+    total = np.einsum("nvlc,nvl->nc", np.where(measured, values, 0).astype(np.float32), counted)
+    return total / np.where(weight > 0, weight, np.nan)

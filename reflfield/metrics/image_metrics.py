@@ -1,0 +1,505 @@
+"""How close relit pictures are to photographs, in the units of the literature.
+
+All measures are taken over *object pixels*: pixels whose silhouette coverage is
+at least one half, eroded by two pixels, so that neither the backdrop nor the
+anti-aliased rim counts. One exposure serves all frames of a comparison,
+
+    e = 1 / (99.5th percentile of the photographs' luminance over the object
+             pixels of all frames),
+
+and nothing is rescaled per picture or per channel: the lights are known.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_erosion
+
+from reflfield.errors import InputError, ShapeError
+from reflfield.metrics.image_errors import (
+    PIXELS_PER_DEGREE,
+    PSNR_CAP_DB,
+    flip_map,
+    psnr_of_mean_square,
+    ssim_map,
+    strips,
+)
+from reflfield.metrics.tonemapping import ThinnedValues, display, luminance
+
+Image = NDArray[np.float64]
+
+COVERAGE_OF_OBJECT = 0.5
+EROSION_PX = 2
+EXPOSURE_PERCENTILE = 99.5
+
+# What is said of a frame, in the order of ``metrics.json``.
+FRAME_KEYS = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels", "n_excluded",
+              "silhouette_from")  # fmt: skip
+
+DEFINITIONS: Mapping[str, str] = {
+    "object_pixels": "silhouette coverage >= 0.5, eroded by a disk of radius 2 pixels",
+    "exposure": "1 / 99.5th percentile of the photographs' luminance over all object pixels",
+    "psnr_ldr": "on sRGB(clip(exposure * x, 0, 1)), peak 1, dB, capped",
+    "psnr_hdr": "on exposure * x, peak 1, dB, capped",
+    "ssim": "scikit-image, uniform 7 x 7 window, on the LDR pictures, map averaged",
+    "flip": "LDR-FLIP, map averaged; 0 is equal, 1 is the worst",
+    "backdrop": "black in both pictures where coverage < 0.5, so windows do not see it",
+    "excluded": "pixels where the photograph is saturated; equal in both pictures, not counted",
+    "colour_ratio": "sum of relit / sum of photograph over object pixels, per channel",
+}
+
+
+class NothingToMeasure(InputError):
+    """No frame shows a pixel of the object that could be measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """A photograph and the picture rendered for the same camera and light.
+
+    Attributes
+    ----------
+    name : str
+        Frame name, quoted in results and errors.
+    photograph, relit : (h, w, 3) float
+        Linear radiance.
+    silhouette : (h, w) float
+        Coverage by the object, 0 to 1.
+    excluded : (h, w) bool, optional
+        True where the photograph is no measurement, such as saturated pixels.
+    silhouette_from : str
+        Where the silhouette comes from.
+    """
+
+    name: str
+    photograph: NDArray[Any]
+    relit: NDArray[Any]
+    silhouette: NDArray[Any]
+    excluded: NDArray[np.bool_] | None = None
+    silhouette_from: str = "given"
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """(h, w) True where the pixel is measured: on the object, and a measurement."""
+        inside = object_pixels(self.silhouette)
+        return inside if self.excluded is None else inside & ~self.excluded
+
+
+@dataclass(frozen=True)
+class FrameMetrics:
+    """Measures of one frame; see `DEFINITIONS`.
+
+    Attributes
+    ----------
+    psnr_ldr, psnr_hdr : float
+        dB, at most `PSNR_CAP_DB`.
+    ssim, flip : float
+    n_pixels : int
+        Object pixels measured.
+    colour_ratio : tuple of three float or None
+        Relit over photograph per channel; None where the photograph is black.
+    n_excluded : int
+        Object pixels left out because the photograph is saturated there.
+    silhouette_from : str
+        Where the silhouette comes from.
+    """
+
+    name: str
+    psnr_ldr: float
+    psnr_hdr: float
+    ssim: float
+    flip: float
+    n_pixels: int
+    colour_ratio: tuple[float | None, float | None, float | None]
+    n_excluded: int = 0
+    silhouette_from: str = "given"
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``metrics.json`` says of the frame; see `Comparison.from_dict`."""
+        return {key: getattr(self, key) for key in FRAME_KEYS}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Measures of all frames, their mean, and how they were taken.
+
+    Attributes
+    ----------
+    frames : tuple of FrameMetrics
+    exposure : float
+        The factor e that all pictures were multiplied with.
+    warnings : tuple of str
+        What a reader of the numbers should know.
+    not_measured : tuple of str
+        Frames that show no pixel of the object that could be measured.
+    """
+
+    frames: tuple[FrameMetrics, ...]
+    exposure: float
+    warnings: tuple[str, ...] = ()
+    not_measured: tuple[str, ...] = ()
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Plain mean over frames of every measure."""
+        keys = ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels")
+        return {k: float(np.mean([getattr(f, k) for f in self.frames])) for k in keys}
+
+    @property
+    def colour_ratio(self) -> tuple[float | None, ...]:
+        """Mean over frames of the ratio relit / photograph, per channel."""
+        columns = zip(*(f.colour_ratio for f in self.frames), strict=True)
+        kept = [[r for r in column if r is not None] for column in columns]
+        return tuple(float(np.mean(column)) if column else None for column in kept)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``metrics.json``; see `to_json`."""
+        return {
+            "frames": [frame.to_dict() for frame in self.frames],
+            "mean": self.mean,
+            "measured": self.measured,
+            "extra": {
+                "exposure": self.exposure,
+                "pixels_per_degree": PIXELS_PER_DEGREE,
+                "psnr_cap_db": PSNR_CAP_DB,
+                "colour_ratio": list(self.colour_ratio),
+                "frames": [
+                    {"name": f.name, "colour_ratio": list(f.colour_ratio)} for f in self.frames
+                ],
+                "definitions": dict(DEFINITIONS),
+                "warnings": list(self.warnings),
+            },
+        }
+
+    @property
+    def measured(self) -> dict[str, Any]:
+        """On what the measures were taken: counts over all frames."""
+        origins = [frame.silhouette_from for frame in self.frames]
+        return {
+            "frames": len(self.frames),
+            "pixels": sum(frame.n_pixels for frame in self.frames),
+            "saturated_pixels_left_out": sum(frame.n_excluded for frame in self.frames),
+            "silhouettes": {origin: origins.count(origin) for origin in sorted(set(origins))},
+            "frames_not_measured": list(self.not_measured),
+        }
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> Comparison:
+        """The comparison that `to_dict` has told the content of."""
+        extra = content["extra"]
+        ratios = {more["name"]: tuple(more["colour_ratio"]) for more in extra["frames"]}
+        frames = tuple(
+            FrameMetrics(**frame, colour_ratio=ratios[frame["name"]])
+            for frame in content["frames"]
+        )
+        return Comparison(
+            frames,
+            extra["exposure"],
+            tuple(extra["warnings"]),
+            tuple(content["measured"]["frames_not_measured"]),
+        )
+
+    def to_json(self) -> str:
+        """``metrics.json``: frames, mean, and under "extra" what else was found."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+
+def metrics_text(compared: Mapping[str, Any] | None, **more: Any) -> str:
+    """Text of ``metrics.json``: every frame, the mean, on what they were measured, and more."""
+    nothing: dict[str, Any] = {"frames": [], "mean": {}, "measured": {}}
+    kept = nothing if compared is None else {name: compared[name] for name in nothing}
+    return json.dumps({**kept, **more}, indent=2, allow_nan=False) + "\n"
+
+
+def object_pixels(silhouette: ArrayLike) -> NDArray[np.bool_]:
+    """Pixels that count: coverage >= 0.5, eroded by a disk of radius 2 pixels.
+
+    Beyond the border of the picture nothing is known to be object, so the two
+    outermost pixels never count.
+
+    Parameters
+    ----------
+    silhouette : (h, w) array_like
+        Coverage, 0 to 1.
+
+    Returns
+    -------
+    (h, w) bool
+        True where the pixel counts.
+
+    Examples
+    --------
+    >>> object_pixels(np.ones((7, 6))).sum(axis=1).tolist()
+    [0, 0, 2, 2, 2, 0, 0]
+    """
+    covered = np.asarray(silhouette) >= COVERAGE_OF_OBJECT
+    # Two rounds of the 4-neighbour cross remove exactly the disk of radius 2.
+    return binary_erosion(covered, iterations=EROSION_PX)
+
+
+def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
+    """Exposure e of a whole comparison; one pass over the photographs.
+
+    Parameters
+    ----------
+    pictures : iterable of ((h, w, 3), (h, w))
+        Photograph (linear) and silhouette of every frame; or, instead of the silhouette,
+        True for the pixels that count.
+
+    Returns
+    -------
+    float
+        Exposure; ``nan`` if the percentile is not positive (photographs are
+        black), because then no exposure is defined.
+
+    Raises
+    ------
+    InputError
+        If no frame has an object pixel.
+
+    Notes
+    -----
+    Exact up to `ThinnedValues.most` object pixels, of an even part of them beyond.
+
+    Examples
+    --------
+    >>> grey = np.full((9, 9, 3), 0.25)
+    >>> round(common_exposure([(grey, np.ones((9, 9)))]), 6)
+    4.0
+    """
+    kept, n_frames = ThinnedValues(), 0
+    for photograph, silhouette in pictures:
+        n_frames += 1
+        kept.add(luminance(np.asarray(photograph)[_counted(silhouette)]))
+    values = kept.values
+    if values.size == 0:
+        raise NothingToMeasure(
+            "frames: expected at least one object pixel to set the exposure from, received "
+            f"none in {n_frames} frames; check the silhouettes"
+        )
+    white = float(np.percentile(values, EXPOSURE_PERCENTILE))
+    return 1.0 / white if white > 0.0 else math.nan
+
+
+def _counted(silhouette: ArrayLike) -> NDArray[np.bool_]:
+    pixels: NDArray[Any] = np.asarray(silhouette)
+    return pixels if pixels.dtype == np.bool_ else object_pixels(pixels)
+
+
+def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -> Comparison:
+    """Measure relit pictures against photographs, all at one exposure.
+
+    Parameters
+    ----------
+    frames : iterable of FramePair
+        Read twice (exposure, then measures). A one-shot iterator is kept in
+        memory; pass an object that can be iterated again, or `exposure`, to
+        hold one frame at a time.
+    exposure : float, optional
+        Exposure from `common_exposure`, if known already.
+
+    Returns
+    -------
+    Comparison
+
+        Frames without a pixel that counts are left out and named.
+
+    Raises
+    ------
+    InputError
+        If there is no frame, or none with a pixel that counts, or a value under one is
+        not finite. The message names the frame.
+    ShapeError
+        If photograph, relit picture and silhouette differ in size.
+
+    Examples
+    --------
+    White photographs, relit 10 % too dark: HDR error 0.1, so 20 dB.
+
+    >>> white = np.ones((16, 16, 3))
+    >>> result = compare_frames([FramePair("a", white, 0.9 * white, np.ones((16, 16)))])
+    >>> round(result.mean["psnr_hdr"], 9), result.frames[0].n_pixels
+    (20.0, 144)
+    """
+    pairs = list(frames) if isinstance(frames, Iterator) else frames
+    if exposure is None:
+        exposure = common_exposure((p.photograph, p.counted) for p in _checked(pairs))
+    notes: tuple[str, ...] = ()
+    if math.isnan(exposure):
+        exposure = 1.0
+        notes = ("The photographs are black over the object; exposure 1 was used.",)
+    measured, left_out = [], []
+    for pair in pairs:
+        if pair.counted.any():
+            measured.append(measure_frame(pair, exposure))
+        else:
+            left_out.append(pair.name)
+    if not measured:
+        raise NothingToMeasure(
+            "frames: expected at least one frame with object pixels to compare, received none"
+            + (f" ({', '.join(left_out)} have none); check the silhouettes" if left_out else "")
+        )
+    return Comparison(tuple(measured), exposure, notes, tuple(left_out))
+
+
+def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
+    """Measures of one frame at a given exposure.
+
+    Parameters
+    ----------
+    pair : FramePair
+    exposure : float
+        From `common_exposure`.
+
+    Returns
+    -------
+    FrameMetrics
+
+    Raises
+    ------
+    InputError
+        If the frame has no object pixel or a value under one is not finite.
+    ShapeError
+        If the pictures differ in size.
+    """
+    check_pair(pair)
+    counted = pair.counted
+    if not counted.any():
+        raise InputError(
+            f"frame {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, eroded "
+            "by 2 pixels), received none; leave the frame out or check its silhouette"
+        )
+    sums = _sums(pair, counted, exposure)
+    n = int(counted.sum())
+    return FrameMetrics(
+        name=pair.name,
+        psnr_ldr=psnr_of_mean_square(sums["ldr"] / (3 * n)),
+        psnr_hdr=psnr_of_mean_square(sums["hdr"] / (3 * n)),
+        ssim=sums["ssim"] / n,
+        flip=sums["flip"] / n,
+        n_pixels=n,
+        colour_ratio=_colour_ratio(*sums["colours"]),
+        n_excluded=int((object_pixels(pair.silhouette) & ~counted).sum()),
+        silhouette_from=pair.silhouette_from,
+    )
+
+
+def _sums(pair: FramePair, counted: NDArray[np.bool_], exposure: float) -> dict[str, Any]:
+    """Sums over the pixels that count: squared errors, SSIM, FLIP, and both pictures."""
+    sums: dict[str, Any] = dict.fromkeys(("ldr", "hdr", "ssim", "flip"), 0.0)
+    sums["colours"] = np.zeros((2, 3))
+    for own, wide, inner in strips(*counted.shape):
+        here = counted[own]
+        if not here.any():
+            continue
+        pictures = without_backdrop(pair, wide)
+        shown = [display(picture, exposure) for picture in pictures]
+        radiance = [picture[inner][here] for picture in pictures]
+        first, second = (picture[inner][here] for picture in shown)
+        sums["ldr"] += float(np.sum((second - first) ** 2))
+        first, second = (exposure * values for values in radiance)
+        sums["hdr"] += float(np.sum((second - first) ** 2))
+        sums["ssim"] += float(ssim_map(*shown)[inner][here].sum())
+        sums["flip"] += float(flip_map(*shown)[inner][here].sum(dtype=np.float64))
+        sums["colours"] += [values.sum(axis=0) for values in radiance]
+    return sums
+
+
+def flip_errors(pair: FramePair, exposure: float) -> NDArray[np.float32]:
+    """FLIP error of each pixel of a frame, (h, w) float32; 0 where the object is not near."""
+    covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
+    errors = np.zeros(covered.shape, np.float32)
+    for own, wide, inner in strips(*covered.shape):
+        if covered[wide].any():
+            shown = [display(picture, exposure) for picture in without_backdrop(pair, wide)]
+            errors[own] = flip_map(*shown)[inner]
+    return errors
+
+
+def check_pair(pair: FramePair) -> None:
+    """Demand equal sizes and finite values.
+
+    Raises
+    ------
+    ShapeError
+        If photograph, relit picture and silhouette differ in size.
+    InputError
+        If a value where coverage >= 0.5 is not finite. Values elsewhere are never
+        read and may be anything.
+    """
+    size = np.shape(pair.silhouette)
+    for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
+        if len(size) != 2 or np.shape(image) != (*size, 3):
+            raise ShapeError(
+                f"frame {pair.name!r}, {what}: expected shape (h, w, 3) with the size of the "
+                f"silhouette, received {np.shape(image)} and silhouette {size}"
+            )
+    covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
+    for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
+        _check_finite(pair.name, what, image, covered)
+
+
+def without_backdrop(pair: FramePair, rows: slice = slice(None)) -> tuple[Image, Image]:
+    """Photograph and relit picture (some rows) as float64, black where coverage < 0.5.
+
+    SSIM and FLIP look at neighbourhoods; a backdrop that the field cannot know
+    must not enter them from outside the silhouette. Nor must a saturated highlight: where
+    pixels are excluded, the relit picture is equal to the photograph.
+    """
+    covered = (np.asarray(pair.silhouette)[rows] >= COVERAGE_OF_OBJECT)[..., None]
+    photograph, relit = (
+        np.where(covered, np.asarray(np.asarray(image)[rows], dtype=np.float64), 0.0)
+        for image in (pair.photograph, pair.relit)
+    )
+    if pair.excluded is not None:
+        relit = np.where(pair.excluded[rows][..., None], photograph, relit)
+    return photograph, relit
+
+
+def _checked(pairs: Iterable[FramePair]) -> Iterator[FramePair]:
+    for pair in pairs:
+        check_pair(pair)
+        yield pair
+
+
+def _check_finite(
+    name: str, what: str, image: NDArray[Any], covered: NDArray[np.bool_]
+) -> None:
+    bad = covered & ~np.isfinite(image).all(axis=-1)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise InputError(
+            f"frame {name!r}, {what}: expected finite radiance on the object, received "
+            f"{np.asarray(image)[row, column].tolist()} at row {row}, column {column} "
+            f"({int(bad.sum())} such pixels); repair the picture or leave the frame out"
+        )
+
+
+def _colour_ratio(
+    photograph: NDArray[np.float64], relit: NDArray[np.float64]
+) -> tuple[float | None, float | None, float | None]:
+    """Of the sums (3,) of both pictures."""
+    red, green, blue = (
+        float(got / want) if want > 0.0 else None
+        for want, got in zip(photograph, relit, strict=True)
+    )
+    return red, green, blue
+
+
+def worst_to_best(frames: Sequence[FrameMetrics]) -> list[FrameMetrics]:
+    """Frames by falling FLIP error, ties by name.
+
+    Examples
+    --------
+    >>> make = lambda name, flip: FrameMetrics(name, 30, 30, 0.9, flip, 9, (1, 1, 1))
+    >>> [f.name for f in worst_to_best([make("a", 0.1), make("b", 0.3)])]
+    ['b', 'a']
+    """
+    return sorted(frames, key=lambda f: (-f.flip, f.name))

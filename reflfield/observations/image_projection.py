@@ -1,0 +1,471 @@
+"""Photographs into texture space: one apparent BRDF sample per texel, view and light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.capture import Capture
+from reflfield.capture.lights import Light
+from reflfield.errors import InputError
+from reflfield.observations.store import (
+    UNIT,
+    Location,
+    chunk_shape,
+    create_samples,
+    is_written,
+    note_gaps,
+    open_samples,
+)
+from reflfield.util.blocks import Blocks
+from reflfield.util.validation import check_shape
+
+Floats = NDArray[np.float32]
+Kinds = NDArray[np.uint8]
+# What a value of a photograph at a texel may be: measured; at the upper limit of sensor or
+# file; at code 0; under alpha 0; of a colour that the light has not; where it gives nothing.
+VALUE_KINDS = ("measured", "saturated", "black", "transparent", "dark", "unlit")
+# Those that say nothing of the sample.
+NOT_MEASURED = ("saturated", "transparent", "dark")
+# Those that do: black is less than the file can say.
+IS_KNOWN = np.array([kind in ("measured", "black") for kind in VALUE_KINDS])
+IS_GAP = np.array([kind in NOT_MEASURED for kind in VALUE_KINDS])
+# Code 0 is a measurement: it says that the value is less than half of the least code. Numbers
+# spread evenly up to there have cube roots of three quarters of the largest on average, known
+# to a fifth: with the smallest value of the photograph for the least code, this share of it.
+BLACK_SHARE = 0.75**3 / 2
+# A pixel of less weight in a bilinear sample changes it by less than a half float's rounding
+# of eleven bits: what such a pixel is does not matter.
+LEAST_WEIGHT = 2.0**-11
+# Photographs, and texels of each, that the unit of the samples follows from, and the median
+# sample of ordinary captures: a grey of a tenth.
+PHOTOGRAPHS_FOR_UNIT, TEXELS_FOR_UNIT = 16, 1024
+USUAL_SAMPLE = 2.0**-5
+# Largest half float; a mirror-like peak beyond it is held there.
+HALF_MAX = 65504.0
+# Bytes for the photographs that are held at a time.
+BUDGET = 256 << 20
+# Lights sampled together: the pixel positions are worked out once for all of them.
+LIGHTS_AT_ONCE = 32
+
+
+@numba.njit(cache=True, nogil=True)
+def _sample_bilinear(images: Floats, pixels: NDArray[np.float64], out: Floats) -> None:
+    n_images, height, width, _ = images.shape
+    for i in range(len(pixels)):
+        # Pixel centres lie at half-integers; samples beyond the rim read the rim.
+        x = min(max(pixels[i, 0] - 0.5, 0.0), width - 1.0)
+        y = min(max(pixels[i, 1] - 0.5, 0.0), height - 1.0)
+        column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+        s, t = np.float32(x - column), np.float32(y - row)
+        right, below = min(column + 1, width - 1), min(row + 1, height - 1)
+        for j in range(n_images):
+            for c in range(3):
+                upper = (1 - s) * images[j, row, column, c] + s * images[j, row, right, c]
+                lower = (1 - s) * images[j, below, column, c] + s * images[j, below, right, c]
+                out[i, j, c] = (1 - t) * upper + t * lower
+
+
+def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
+    """Values of images at pixel positions.
+
+    Parameters
+    ----------
+    images : (n_images, h, w, 3) float32
+        Linear radiance.
+    pixels : (n, 2) float64
+        x and y; the centre of the top-left pixel is (0.5, 0.5). Beyond the image, the rim.
+
+    Returns
+    -------
+    (n, n_images, 3) float32
+
+    Raises
+    ------
+    ShapeError
+        If a shape is wrong.
+    InputError
+        If a pixel is NaN: the camera does not image that point.
+
+    Examples
+    --------
+    >>> ramp = np.zeros((1, 1, 3, 3), np.float32)
+    >>> ramp[0, 0] = [[0.0], [1.0], [2.0]]
+    >>> float(sample_bilinear(ramp, np.array([[1.25, 0.5]]))[0, 0, 0])
+    0.75
+    """
+    check_shape("images", images, (None, None, None, 3))
+    check_shape("pixels", pixels, (None, 2))
+    absent = np.isnan(pixels).any(axis=1)
+    if absent.any():
+        raise InputError(
+            f"pixels: expected numbers, received NaN in row {int(absent.argmax())}; "
+            "leave out points that the camera does not image"
+        )
+    out = np.zeros((len(pixels), len(images), 3), np.float32)
+    _sample_bilinear(
+        np.ascontiguousarray(images, np.float32), np.ascontiguousarray(pixels, np.float64), out
+    )
+    return out
+
+
+def facing_irradiance(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> Floats:
+    """Irradiance (n, n_lights, 3) that a surface facing each light gets; 1 if unknown."""
+    points = np.asarray(positions, np.float64)
+    return np.stack([light.irradiance(points) for light in lights], axis=1).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Photographs and the texels that they are projected onto.
+
+    Parameters
+    ----------
+    capture : Capture
+        Photographs, cameras and lights.
+    positions : (n_texels, 3) float
+        Points of the surface, metres.
+    visible : (n_texels, n_views) bool
+        True where the camera sees the texel; other samples are zero.
+    location : Path or str
+        Store to write.
+    budget : int
+        Bytes for the photographs held at a time. The samples do not depend on it.
+    """
+
+    capture: Capture
+    positions: NDArray[np.floating]
+    visible: NDArray[np.bool_]
+    location: Location
+    budget: int = BUDGET
+
+    def __post_init__(self) -> None:
+        check_shape("positions", self.positions, (None, 3))
+        check_shape("visible", self.visible, (len(self.positions), self.capture.n_views))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Texels, views and lights."""
+        return len(self.positions), self.capture.n_views, self.capture.n_lights
+
+    def views_of_chunks(self) -> list[range]:
+        """Views whose samples are written together."""
+        step = chunk_shape(*self.shape)[1]
+        n_views = self.capture.n_views
+        return [range(i, min(i + step, n_views)) for i in range(0, n_views, step)]
+
+
+@dataclass(frozen=True, eq=False)
+class LookedInto:
+    """Samples (n) of a few photographs.
+
+    Parameters
+    ----------
+    photograph, texel : (n,) int64
+        Indices.
+    values : (n, 3) float32
+        Radiance over the light's irradiance; NaN where nothing is known of it.
+    measured : (n, 3) bool
+        False where a value is a bound, or known without the photograph.
+    """
+
+    photograph: NDArray[np.int64]
+    texel: NDArray[np.int64]
+    values: Floats
+    measured: NDArray[np.bool_]
+
+    def brightness(self) -> NDArray[np.float64]:
+        """Mean (n,) of the channels that are known; NaN where none is."""
+        known = np.isfinite(self.values)
+        total = np.where(known, self.values, 0.0).sum(axis=1, dtype=np.float64)
+        mean: NDArray[np.float64] = np.where(
+            known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan
+        )
+        return mean
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """What the projection found in the photographs.
+
+    Parameters
+    ----------
+    photographs : int
+        That were read.
+    values : (n_views, len(VALUE_KINDS)) int64
+        Values of the texels that each camera sees, three for each photograph and texel, by
+        what they are: see `VALUE_KINDS`.
+    measured : (n_texels, n_lights) bool
+        True where some camera measured a value under the light.
+    brightest : float
+        Largest sample, 1/sr; 0 where everything is dark.
+    looked_into : LookedInto
+        Some of the samples.
+    """
+
+    photographs: int
+    values: NDArray[np.int64]
+    measured: NDArray[np.bool_]
+    brightest: float
+    looked_into: LookedInto
+
+    def count(self, kind: str) -> int:
+        """Values of one kind, all cameras together."""
+        return int(self.values[:, VALUE_KINDS.index(kind)].sum())
+
+
+def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1) -> Projected:
+    """Write the samples of all texels: radiance divided by the light's irradiance.
+
+    Parameters
+    ----------
+    projection : Projection
+    blocks : Blocks
+        Who does it, a few views at a time; what an interrupted run has written is kept.
+    at_once : int
+        Threads for whose blocks there is memory: a block takes the samples of its views and
+        `Projection.budget`.
+
+    Returns
+    -------
+    Projected
+
+    Raises
+    ------
+    CaptureError
+        If a photograph cannot be read.
+    ShapeError
+        If shapes disagree.
+    InputError
+        If the store holds other samples.
+
+    Notes
+    -----
+    Every photograph is read once, a few of them (`PHOTOGRAPHS_FOR_UNIT`) before, to choose the
+    unit of the samples.
+    """
+    first = LookedInto(**blocks.once("first", lambda: vars(look_into(projection))))
+    create_samples(projection.location, *projection.shape, sample_unit(first))
+    parts = blocks.map(
+        "projecting photographs",
+        project_views,
+        projection,
+        projection.views_of_chunks(),
+        intact=has_views,
+        at_once=at_once,
+    )
+    n_photographs, values, brightest = 0, [], 0.0
+    measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
+    for part in parts:
+        n_photographs += int(part["photographs"])
+        values.append(part["values"])
+        measured |= part["measured"]
+        brightest = max(brightest, float(part["brightest"]))
+    bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
+    found = Projected(n_photographs, np.concatenate(values), bits, brightest, first)
+    n_gaps = sum(found.count(kind) for kind in NOT_MEASURED)
+    note_gaps(projection.location, n_gaps / max(int(found.values.sum()), 1))
+    return found
+
+
+def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any]]:
+    """Write the samples of a few views; gives the number of photographs read, and of values."""
+    points = np.asarray(projection.positions, np.float64)
+    n_lights = projection.capture.n_lights
+    block = np.zeros((len(points), len(views), n_lights, 3), np.float16)
+    counts = np.zeros((len(views), len(VALUE_KINDS)), np.int64)
+    measured = np.zeros((len(points), n_lights), np.bool_)
+    store = open_samples(projection.location)
+    unit = float(store.attrs[UNIT])
+    n_read, brightest = 0, 0.0
+    for i, view in enumerate(views):
+        seen = np.flatnonzero(projection.visible[:, view])
+        for lights, values, kinds in _view_samples(
+            projection.capture, view, points[seen], projection.budget
+        ):
+            stored = np.clip(values / np.float32(unit), -HALF_MAX, HALF_MAX)
+            block[seen[:, None], i, lights] = stored.astype(np.float16)
+            counts[i] += _counts_of(kinds)
+            measured[seen[:, None], lights] |= IS_KNOWN[kinds].any(axis=2)
+            n_read += len(lights)
+            brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
+    store[:, views.start : views.stop] = block
+    return {
+        "photographs": np.array(n_read),
+        "values": counts,
+        "measured": np.packbits(measured, axis=1),
+        "brightest": np.array(brightest),
+    }
+
+
+def _counts_of(kinds: Kinds) -> NDArray[np.int64]:
+    """Values of each kind; most photographs have one."""
+    if kinds.any():
+        return np.bincount(kinds.ravel(), minlength=len(VALUE_KINDS)).astype(np.int64)
+    return np.array([kinds.size] + [0] * (len(VALUE_KINDS) - 1), np.int64)
+
+
+def has_views(projection: Projection, views: range) -> bool:
+    """Whether the store holds the samples of some views, whole."""
+    store = open_samples(projection.location)
+    return is_written(store, (slice(None), slice(views.start, views.stop)))
+
+
+def look_into(projection: Projection) -> LookedInto:
+    """Samples of a few photographs, spread evenly over the capture, at texels spread so."""
+    capture, n = projection.capture, len(projection.capture.photographs)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
+    found = []
+    for index in chosen:
+        photograph = capture.photographs[index]
+        seen = np.flatnonzero(projection.visible[:, photograph.camera])
+        some = seen[:: max(1, len(seen) // TEXELS_FOR_UNIT)]
+        points = np.asarray(projection.positions[some], np.float64)
+        pixels, _ = capture.cameras[photograph.camera].project(points)
+        lights = np.array([photograph.light])
+        values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
+        found.append((np.full(len(some), index), some, values[:, 0], kinds[:, 0] == 0))
+    return LookedInto(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def sample_unit(looked_into: LookedInto) -> float:
+    """Unit in which halves hold the samples of a capture: a power of 64.
+
+    Cube and square root of such a power are powers of two, so that no digit changes whatever
+    the domain of the factorization is. Samples of ordinary captures, whose median is near
+    `USUAL_SAMPLE`, are stored as they are, in units of 1.
+    """
+    positive = looked_into.values[looked_into.measured & (looked_into.values > 0)]
+    if not len(positive):
+        return 1.0
+    size = float(np.median(positive.astype(np.float64)))
+    return float(64.0 ** np.round(np.log2(size / USUAL_SAMPLE) / 6.0))
+
+
+def _view_samples(
+    capture: Capture, view: int, points: NDArray[np.float64], budget: int
+) -> Iterator[tuple[NDArray[np.intp], Floats, Kinds]]:
+    """Samples and kinds (n_points, n, 3) of one view, some lights at a time."""
+    pixels, _ = capture.cameras[view].project(points)
+    photographed = np.flatnonzero(capture.photograph_index[view] >= 0)
+    camera = capture.cameras[view]
+    # A photograph with the copies made of it while reading, and its samples.
+    each = 12 * (3 * camera.width * camera.height + 4 * len(points))
+    together = int(np.clip(budget // max(each, 1), 1, LIGHTS_AT_ONCE))
+    for lights in np.array_split(photographed, max(1, -(-len(photographed) // together))):
+        if len(lights):
+            yield lights, *_samples_at(capture, view, lights, points, pixels)
+
+
+def _samples_at(
+    capture: Capture,
+    view: int,
+    lights: NDArray[np.intp],
+    points: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+) -> tuple[Floats, Kinds]:
+    """Samples of one view at the pixels of points, and of what kind each value is."""
+    indices = capture.photograph_index[view, lights]
+    camera = capture.cameras[view]
+    images = np.zeros((len(lights), camera.height, camera.width, 3), np.float32)
+    kinds = np.zeros((len(points), len(lights), 3), np.uint8)
+    for j, index in enumerate(indices):
+        image, measured = capture.read_measured(int(index))
+        if not measured.all():
+            of_pixels = pixel_kinds(image, measured)
+            image = with_bounded_black(image, of_pixels)
+            _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
+        images[j] = image
+    irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
+    # A light may have no blue, a spot may miss a texel: nothing is learned there.
+    lit = irradiance > 0
+    values = sample_bilinear(images, pixels)
+    values /= np.where(lit, irradiance, np.float32(1.0))
+    kinds[~lit] = VALUE_KINDS.index("dark")
+    unlit = ~lit.any(axis=2)
+    kinds[unlit] = VALUE_KINDS.index("unlit")
+    # What lies outside a spot's cone follows from the light alone, and stays black.
+    values[unlit] = 0.0
+    if kinds.any():
+        values[IS_GAP[kinds]] = np.nan
+    return values, kinds
+
+
+def pixel_kinds(image: Floats, measured: NDArray[np.bool_]) -> Kinds:
+    """Of what kind each value (h, w, 3) of a photograph is: a place in `VALUE_KINDS`.
+
+    A value that is no measurement is black where it is zero, saturated where it is at least
+    half of the largest of its channel, and else lies under alpha 0.
+    """
+    bright = image >= 0.5 * image.max(axis=(0, 1))
+    kinds = np.full(image.shape, VALUE_KINDS.index("transparent"), np.uint8)
+    kinds[bright] = VALUE_KINDS.index("saturated")
+    kinds[image <= 0] = VALUE_KINDS.index("black")
+    kinds[measured] = 0
+    return kinds
+
+
+def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
+    """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
+
+    Examples
+    --------
+    >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
+    >>> kinds = pixel_kinds(image, image > 0)
+    >>> with_bounded_black(image, kinds)[0, 0].round(3)
+    array([0.105, 0.021, 0.211], dtype=float32)
+    """
+    black = kinds == VALUE_KINDS.index("black")
+    if not black.any():
+        return image
+    positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)
+    darkest = np.where(np.isfinite(positive), positive, 0.0)
+    return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_kinds(
+    kinds: Kinds, pixels: NDArray[np.float64], least_weight: float, out: Kinds
+) -> None:
+    """Kind (n, 3) of each sampled value: that of its heaviest pixel that is no measurement."""
+    height, width, _ = kinds.shape
+    for i in range(len(pixels)):
+        x = min(max(pixels[i, 0] - 0.5, 0.0), width - 1.0)
+        y = min(max(pixels[i, 1] - 0.5, 0.0), height - 1.0)
+        column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+        s, t = x - column, y - row
+        for c in range(3):
+            most = least_weight
+            for corner in range(4):
+                right, below = corner & 1, corner >> 1
+                weight = (s if right else 1 - s) * (t if below else 1 - t)
+                kind = kinds[min(row + below, height - 1), min(column + right, width - 1), c]
+                if kind != 0 and weight > most:
+                    most, out[i, c] = weight, kind
+
+
+def directions_of(
+    capture: Capture, positions: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unit directions from each texel to all cameras and all lights, world frame.
+
+    Returns
+    -------
+    views : (n, n_views, 3) float32
+    lights : (n, n_lights, 3) float32
+        Of an unknown light, world +Z: its direction does not enter.
+    """
+    points = np.asarray(positions, np.float64)
+    views = np.stack([camera.view_directions(points) for camera in capture.cameras], axis=1)
+    lights = np.stack([light.directions(points) for light in capture.lights], axis=1)
+    return views.astype(np.float32), lights.astype(np.float32)
+
+
+def pairs_photographed(capture: Capture) -> NDArray[np.bool_]:
+    """(n_views, n_lights) True where a photograph exists."""
+    return capture.photograph_index >= 0

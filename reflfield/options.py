@@ -1,0 +1,420 @@
+"""Options of all stages: one frozen dataclass each, from TOML and from ``--set``."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import sys
+import tomllib
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
+from numbers import Integral
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import tomli_w
+
+from reflfield.errors import InputError
+from reflfield.util.files import read_bytes
+
+Options = TypeVar("Options")
+# A configuration file is written by hand: anything larger is another file.
+LARGEST_FILE = 1 << 20
+# Keys of very many parts take time and memory that grow with the square of their number.
+LONGEST_LINE = 4096
+# Whole numbers that fit 63 bits, and what else is said of values in messages.
+LARGEST_WHOLE = (1 << 63) - 1
+LONGEST_SHOWN = 100
+# Of an option's name: stage, group, option.
+MOST_PARTS = 8
+# Libraries and code take 0.4 GB before the first photograph is read.
+LEAST_MEMORY = 1 << 30
+# Threads beyond any machine's cores: a number above is a slip.
+MOST_WORKERS = 1024
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Tables of a TOML file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is no regular one, or is not TOML; the message names it.
+    """
+    content = read_bytes(path, LARGEST_FILE)
+    if max(map(len, content.splitlines()), default=0) > LONGEST_LINE:
+        raise InputError(
+            f"{path}: expected options in TOML, received a line of more "
+            f"than {LONGEST_LINE} bytes"
+        )
+    try:
+        return tomllib.loads(content.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # ValueError also of numbers without end
+        raise InputError(f"{path}: expected TOML, received something else: {error}") from error
+
+
+def write_toml(path: Path, options: Any, notes: Iterable[str] = ()) -> None:
+    """Write nested option dataclasses, below notes; what is None is left out."""
+    comments = "".join(f"# {note}\n" for note in notes)
+    tables = tomli_w.dumps(_without_none(dataclasses.asdict(options)))
+    path.write_text(comments + tables, encoding="utf-8")
+
+
+def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
+    """Tables of ``stage.option=value`` words; values are TOML, bare words are text.
+
+    Raises
+    ------
+    InputError
+        If a word has another form.
+
+    Examples
+    --------
+    >>> parse_settings(["hull.resolution=128", "resampling.visibility=kept", "seed=3"])
+    {'hull': {'resolution': 128}, 'resampling': {'visibility': 'kept'}, 'seed': 3}
+    """
+    tables: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        path = [part.strip() for part in name.split(".")]
+        if not (equals and all(path)):
+            raise InputError(f"--set: expected stage.option=value, received {_shown(setting)}")
+        if len(path) > MOST_PARTS:
+            raise InputError(
+                f"--set: expected stage.option=value, received a name of {len(path)} parts"
+            )
+        table: Any = _toml_value(text.strip())
+        for part in reversed(path):
+            table = {part: table}
+        tables = merged(tables, table)
+    return tables
+
+
+def _toml_value(text: str) -> Any:
+    if len(text) > LONGEST_LINE:
+        return text
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):  # ValueError also of numbers without end
+        return text
+
+
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables of `first`, overridden option by option by `second`.
+
+    Examples
+    --------
+    >>> merged({"hull": {"blur": 1.0}, "seed": 1}, {"hull": {"tolerance": 2}})
+    {'hull': {'blur': 1.0, 'tolerance': 2}, 'seed': 1}
+    """
+    result = dict(first)
+    for name, value in second.items():
+        earlier = result.get(name)
+        both = isinstance(value, Mapping) and isinstance(earlier, Mapping)
+        result[name] = merged(earlier, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") -> Options:
+    """Options with the values of nested tables in place of the defaults.
+
+    Parameters
+    ----------
+    options : dataclass
+        Frozen; fields are options or further dataclasses.
+    tables : mapping
+        By field name; nested for dataclass fields.
+    where : str
+        Prefix for messages.
+
+    Returns
+    -------
+    dataclass
+        Same type.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown (near names are suggested) or a value has the wrong type.
+    """
+    hints = get_type_hints(type(options))
+    known = [f.name for f in fields(options)]  # type: ignore[arg-type]
+    changes: dict[str, Any] = {}
+    for name, value in tables.items():
+        label = f"{where}{name}"
+        if name not in known:
+            raise InputError(_unknown(label, name, known))
+        current = getattr(options, name)
+        if is_dataclass(current):
+            if not isinstance(value, Mapping):
+                raise InputError(
+                    f"option {label!r}: expected a table, received {_shown(value)}"
+                )
+            changes[name] = with_tables(current, value, f"{label}.")
+        else:
+            changes[name] = _converted(label, value, hints[name])
+    try:
+        return replace(options, **changes)  # type: ignore[type-var]
+    except InputError as error:
+        raise InputError(f"option {where}{error}") from error
+
+
+def _unknown(label: str, name: str, known: list[str]) -> str:
+    near = get_close_matches(name, known, n=1)
+    remedy = f"; did you mean {near[0]!r}?" if near else ""
+    return f"option {_shown(label)}: unknown; expected one of {', '.join(known)}{remedy}"
+
+
+def _converted(label: str, value: Any, expected: Any) -> Any:
+    """Value as the annotated type, or an error that names both."""
+    origin = get_origin(expected)
+    if origin in (Union, types.UnionType):
+        return _first_that_fits(label, value, expected)
+    if origin is tuple:
+        return _converted_tuple(label, value, expected)
+    if origin is Literal:
+        fits = value in get_args(expected)
+    elif expected is float and _is_number(value):
+        fits = abs(value) <= sys.float_info.max  # nor is NaN
+        value = float(value) if fits else value
+    else:
+        # True is an int to Python, and not to those who write options.
+        fits = isinstance(value, expected) and isinstance(value, bool) == (expected is bool)
+        fits = fits and not (expected is int and abs(value) > LARGEST_WHOLE)
+    if not fits:
+        raise _another_value(label, value, expected)
+    return value
+
+
+def _another_value(label: str, value: Any, expected: Any) -> InputError:
+    received = _shown(value)
+    return InputError(f"option {label!r}: expected {_words(expected)}, received {received}")
+
+
+def _shown(value: Any) -> str:
+    """A value for messages, which a file may have made of any size."""
+    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+        return f"one of {value.bit_length()} bits"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # thousands of digits or of levels
+        return f"a {type(value).__name__} of numbers or levels without end"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} ..."
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _converted_tuple(label: str, value: Any, expected: Any) -> tuple[Any, ...]:
+    kinds = get_args(expected)
+    given = isinstance(value, (list, tuple))
+    if given and len(kinds) == 2 and kinds[1] is Ellipsis:
+        kinds = kinds[:1] * len(value)
+    if not given or len(value) != len(kinds):
+        raise _another_value(label, value, expected)
+    return tuple(_converted(label, v, kind) for v, kind in zip(value, kinds, strict=True))
+
+
+def _first_that_fits(label: str, value: Any, expected: Any) -> Any:
+    choices = get_args(expected)
+    if value in (None, "none") and type(None) in choices:
+        return None
+    for choice in choices:
+        if choice is type(None):
+            continue
+        try:
+            return _converted(label, value, choice)
+        except InputError:
+            continue
+    raise _another_value(label, value, expected)
+
+
+def _words(expected: Any) -> str:
+    """What a type asks for, as someone would say it who writes options."""
+    origin, inner = get_origin(expected), get_args(expected)
+    if origin is Literal:
+        return " or ".join(map(repr, inner))
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_words, inner))
+    if origin is tuple:
+        return f"a list of {', '.join('...' if i is ... else _words(i) for i in inner)}"
+    names = {bool: "true or false", int: "a whole number", float: "a finite number"}
+    return names.get(expected, {str: "text", type(None): "'none'"}.get(expected, str(expected)))
+
+
+def _without_none(table: dict[str, Any]) -> dict[str, Any]:
+    kept = {name: value for name, value in table.items() if value is not None}
+    return {n: _without_none(v) if isinstance(v, dict) else v for n, v in kept.items()}
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a run may use; nothing of it changes the result.
+
+    Parameters
+    ----------
+    workers : int
+        Threads.
+    max_memory : int
+        Bytes of resident memory that the blocks are sized for.
+    scheduler : str, optional
+        Address of a `dask.distributed` scheduler, whose workers compute the blocks. They
+        open the capture and the store by the names that this process has for them.
+    store : str, optional
+        Folder, or URL for fsspec, that holds the samples of all texels.
+    """
+
+    workers: int = 2
+    max_memory: int = 4 << 30
+    scheduler: str | None = None
+    store: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.workers <= MOST_WORKERS:
+            raise InputError(
+                f"--workers: expected 1 to {MOST_WORKERS}, received {self.workers}"
+            )
+        if self.max_memory < LEAST_MEMORY:
+            raise InputError(
+                f"--max-memory: expected at least {gigabytes(LEAST_MEMORY)}, received "
+                f"{gigabytes(self.max_memory)}: the libraries alone take half of that"
+            )
+
+    @property
+    def block_bytes(self) -> int:
+        """Working memory for one block of texels; each thread has one."""
+        return min(self.max_memory // (8 * self.workers), 256 << 20)
+
+
+def available_cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def gigabytes(size: float) -> str:
+    """Bytes for messages.
+
+    Examples
+    --------
+    >>> gigabytes(1610612736)
+    '1.5 GB'
+    """
+    return f"{size / 2**30:.1f} GB"
+
+
+_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+
+
+def parse_bytes(text: str, option: str = "--max-memory") -> int:
+    """Bytes of a size such as ``4GB`` or ``512MB`` (powers of 1024).
+
+    Raises
+    ------
+    InputError
+        If the text has another form.
+
+    Examples
+    --------
+    >>> parse_bytes("1.5GB")
+    1610612736
+    """
+    upper = text.strip().upper().removesuffix("B").removesuffix("I")
+    digits = upper.rstrip("KMGT")
+    try:
+        return int(float(digits) * _UNITS[upper[len(digits) :]])
+    except (ValueError, KeyError, OverflowError):
+        raise InputError(
+            f"{option}: expected a number with MB or GB, such as 4GB, received {_shown(text)}"
+        ) from None
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """What a run keeps apart from the field's making, and compares the field with.
+
+    Parameters
+    ----------
+    views, lights : int
+        Spread evenly over those that have photographs; none of their photographs makes the
+        field.
+    photographs : int
+        Spread evenly over views and lights; these alone are kept apart. Not together with
+        `views` and `lights`.
+    test : bool
+        The photographs that the capture itself sets apart as its test split. Alone.
+
+    Raises
+    ------
+    InputError
+        If a count is negative or no whole number, or two ways to choose are mixed.
+
+    Examples
+    --------
+    >>> HoldOut(views=2, lights=3).lights
+    3
+    >>> HoldOut(views=2, photographs=3)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...
+    reflfield.errors.InputError: --hold-out: expected ... received views=2,photographs=3
+    """
+
+    views: int = 0
+    lights: int = 0
+    photographs: int = 0
+    test: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("views", "lights", "photographs"):
+            count = getattr(self, name)
+            whole = isinstance(count, Integral) and not isinstance(count, bool)
+            if not whole or count < 0:
+                raise InputError(f"--hold-out {name}: expected a number >= 0, received {count}")
+        by_pairs = self.views > 0 or self.lights > 0
+        if by_pairs + (self.photographs > 0) + self.test > 1:
+            raise InputError(
+                "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
+                f"{self}"
+            )
+
+    def __str__(self) -> str:
+        """As `parse_hold_out` reads it."""
+        counts = {name: getattr(self, name) for name in ("views", "lights", "photographs")}
+        parts = [f"{name}={count}" for name, count in counts.items() if count]
+        return ",".join(parts + ["test"] * self.test)
+
+
+def parse_hold_out(text: str) -> HoldOut:
+    """Counts of ``views=2,lights=3`` or ``photographs=4``, or ``test``.
+
+    Raises
+    ------
+    InputError
+        If the text has another form.
+
+    Examples
+    --------
+    >>> parse_hold_out("lights=3")
+    HoldOut(views=0, lights=3, photographs=0, test=False)
+    """
+    counts: dict[str, int] = {}
+    for part in filter(None, (p.strip() for p in text.split(","))):
+        name, equals, number = part.partition("=")
+        count = int(number) if re.fullmatch("[0-9]{1,9}", number) else -1
+        if part == "test":
+            name, count = "test", 1
+        elif name not in ("views", "lights", "photographs") or not equals:
+            count = -1
+        if count < 0 or name in counts:
+            raise InputError(
+                "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
+                f"{_shown(text)}"
+            )
+        counts[name] = count
+    test = counts.pop("test", 0) > 0
+    return HoldOut(test=test, **counts)

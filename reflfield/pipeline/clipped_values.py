@@ -1,0 +1,86 @@
+"""What of the photographs is no measurement: told, counted, and which texels it leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.capture import Capture
+from reflfield.errors import InputError
+from reflfield.observations.image_projection import VALUE_KINDS, Projected
+
+Bools = NDArray[np.bool_]
+
+# In the folder of the observations: under which lights each texel was measured at all.
+MEASURED = "measured.npz"
+# Less than this share of the values that cameras see is a trace.
+TRACE = 1e-3
+# What is told of, and the remedy. Not of black: an object has sides that no light reaches.
+TOLD = {
+    "saturated": "saturated and left out; expose shorter, or bracket",
+    "transparent": "under alpha 0 and left out; check silhouettes and cameras",
+}
+
+
+def check_measured(capture: Capture, found: Projected) -> None:
+    """Refuse photographs that say nothing of the object.
+
+    Raises
+    ------
+    InputError
+        If no value was measured, or all are 0.
+    """
+    if not found.values.sum():
+        return
+    if found.count("measured") or found.count("black"):
+        if found.brightest <= 0.0:
+            raise InputError(
+                f"{capture.name}: photographs: everything is dark: expected values above 0 "
+                f"where cameras see the object, received {int(found.values.sum())} that are "
+                "all 0; expose longer, and check lights, encoding and silhouettes"
+            )
+        return
+    if not any(light.intensity.any() for light in capture.lights):
+        raise InputError(
+            f"{capture.name}: lights: expected one with an intensity above 0, received "
+            f"{capture.n_lights} that are all 0; nothing can be learned from what dark lights "
+            "show"
+        )
+    parts = ", ".join(f"{found.count(k)} {k}" for k in VALUE_KINDS[1:] if found.count(k))
+    raise InputError(
+        f"{capture.name}: photographs: expected measured values where cameras see the object, "
+        f"received none of {int(found.values.sum())} ({parts}); expose shorter, and check "
+        "lights, alpha channels and silhouettes"
+    )
+
+
+def clipping_lines(capture: Capture, found: Projected) -> Iterator[str]:
+    """Say of what is more than a trace how much there is, and which camera has most."""
+    seen = np.maximum(found.values.sum(axis=1), 1)
+    for kind, text in TOLD.items():
+        counts = found.values[:, VALUE_KINDS.index(kind)]
+        if counts.sum() > TRACE * seen.sum():
+            worst = int(np.argmax(counts / seen))
+            yield (
+                f"photographs: {counts.sum() / seen.sum():.2%} of the values on the object are "
+                f"{text} (most, {counts[worst] / seen[worst]:.1%}, of camera "
+                f"{capture.cameras[worst].id!r})"
+            )
+
+
+def write_measured(folder: Path, measured: Bools) -> None:
+    """Store (n_texels, n_lights) where some camera measured a value under a light."""
+    np.savez_compressed(
+        folder / MEASURED,
+        measured=np.packbits(measured, axis=1),
+        n_lights=np.array(measured.shape[1]),
+    )
+
+
+def stored_measured(arrays: dict[str, NDArray[np.generic]]) -> Bools:
+    """Read what `write_measured` stored."""
+    bits = np.asarray(arrays["measured"], np.uint8)
+    return np.unpackbits(bits, axis=1, count=int(arrays["n_lights"])).astype(np.bool_)

@@ -1,0 +1,245 @@
+"""Fits of clustered models to texels in their aligned frames, on grids and on samples."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.factorization import Completion
+from reflfield.field.clustered_model import ClusteredModel, of_usual_size
+from reflfield.field.clustered_pca import CompressionOptions, cluster_completed, fill_unobserved
+from reflfield.field.coefficients import solve_coefficients
+from reflfield.field.fineness import finer_sides, on_finer_nodes
+from reflfield.field.fit import SampleFitOptions, fit_basis
+from reflfield.field.frame_refinement import improved_block as turned
+from reflfield.observations.texel_reading import TexelReader
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.quantising import FieldMaker
+from reflfield.util.blocks import Blocks
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedFrames:
+    """Frames that a field is fitted in.
+
+    Parameters
+    ----------
+    local_from_base : (n_texels, 3, 3) float64
+    free : (k,) int
+        Texels whose frames were found, and may be improved while the field is fitted.
+    """
+
+    local_from_base: NDArray[np.float64]
+    free: Indices
+
+
+@dataclass(frozen=True, eq=False)
+class Resampled:
+    """Texels on the grids of their frames, what was not observed of them filled.
+
+    Parameters
+    ----------
+    frames : AlignedFrames
+    completion : Completion
+        Of the texels that shape the basis.
+    coefficients : (n_texels, rank) float32
+        Of all texels in that basis.
+    """
+
+    frames: AlignedFrames
+    completion: Completion
+    coefficients: Floats
+
+
+def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
+    """Frames of the texels in the world, from their turns against the base frames."""
+    return (local_from_base @ job.texels.local_from_world).astype(np.float32)
+
+
+def fitted_model(
+    maker: FieldMaker, found: Resampled, blocks: Blocks
+) -> tuple[ClusteredModel, TexelReader]:
+    """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
+    job = maker.job
+    reader = job.base_reader.rotated(local_frames(job, found.frames.local_from_base))
+    model, reader = _chosen_fit(_Fitting(job, found, reader, blocks), maker)
+    return fill_unobserved(model, job.texels.position, job.seen_texels), reader
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitting:
+    """Models of one run in the same frames, of different size.
+
+    Parameters
+    ----------
+    job : Job
+    found : Resampled
+    reader : TexelReader
+        In its frames.
+    blocks : Blocks
+    """
+
+    job: Job
+    found: Resampled
+    reader: TexelReader
+    blocks: Blocks
+
+    def on_grid(self, options: CompressionOptions) -> ClusteredModel:
+        """Model of the resampled columns."""
+        return cluster_completed(
+            self.found.completion,
+            self.found.coefficients,
+            self.job.seen_texels,
+            (self.reader.sides[0] ** 2, self.reader.sides[1] ** 2),
+            options,
+            self.job.options.seed,
+        )
+
+    def fits_samples(self, options: CompressionOptions) -> bool:
+        """Whether the model is then fitted to the samples."""
+        job = self.job
+        return options.fits_samples(job.observed.count() / len(job.seen_texels))
+
+    def fitted(
+        self, options: CompressionOptions, name: str = ""
+    ) -> tuple[ClusteredModel, TexelReader]:
+        """Model, and the reader in frames that were improved on the way; `name` is its own."""
+        model = self.on_grid(options)
+        if not self.fits_samples(options):
+            return model, self.reader
+        free = self.found.frames.free
+        model = of_usual_size(model)
+        return _fitted_to_samples(self.job, model, self.reader, free, self.blocks, name)
+
+
+def _chosen_fit(fitting: _Fitting, maker: FieldMaker) -> tuple[ClusteredModel, TexelReader]:
+    """Model with the clusters and components asked for, or that a size or quality needs."""
+    options = maker.options
+    if not maker.searches:
+        return fitting.fitted(options)
+    frames = fitting.reader.local_from_world
+    if not (options.psnr and fitting.fits_samples(options)):
+        return fitting.fitted(maker.ranked(fitting.on_grid, frames, 0.0)[0])
+    # What the fit to the samples brings is measured once. The least that then promises to
+    # reach the quality is tried first, and the smallest field of those that do is taken.
+    usual = fitting.fitted(options, " for the quality")
+    reached = maker.quality_of(*usual)
+    tried = [(reached, usual)]
+    gain = reached - maker.quality_of(fitting.on_grid(options), fitting.reader)
+    for choice in maker.ranked(fitting.on_grid, frames, gain):
+        name = f" for the quality, {choice.n_clusters} x {choice.n_components}"
+        found = fitting.fitted(choice, name)
+        tried.append((maker.quality_of(*found), found))
+        if tried[-1][0] >= options.psnr:
+            break
+    good = [found for reached, found in tried if reached >= options.psnr]
+    if not good:
+        return max(tried, key=lambda one: one[0])[1]
+    return min(good, key=lambda found: maker.size_of(*found))
+
+
+def _fitted_to_samples(
+    job: Job,
+    model: ClusteredModel,
+    reader: TexelReader,
+    free: Indices,
+    blocks: Blocks,
+    name: str = "",
+) -> tuple[ClusteredModel, TexelReader]:
+    """Fit to the samples; half way, frames that are free are improved and nodes made finer."""
+    options = job.options.compression.samples
+    first, second = options.halves()
+    model = replace(model, residuals=())
+    model = _fitted_once(job, model, reader, first, blocks, f"{name}, part 1")
+    spread = np.radians(options.frame_spread_deg)
+    if len(free) and spread > 0:
+        better = blocks.map(
+            f"frames against the model{name}",
+            turned_block,
+            SampleFit(reader, model, spread),
+            reader.blocks_of(free),
+        )
+        frames = reader.local_from_world.copy()
+        frames[free] = better.joined("frames")
+        reader = reader.rotated(frames)
+    n_functions = len(model.table) * (model.coefficients.shape[1] + 1)
+    sides = finer_sides(reader.sides, n_functions, options.fineness)
+    model, reader = on_finer_nodes(model, sides), replace(reader, sides=sides)
+    return _fitted_once(job, model, reader, second, blocks, f"{name}, part 2"), reader
+
+
+def _fitted_once(
+    job: Job,
+    model: ClusteredModel,
+    reader: TexelReader,
+    options: SampleFitOptions,
+    blocks: Blocks,
+    part: str,
+) -> ClusteredModel:
+    """Basis of some texels, then coefficients of all: `fit_samples` by blocks."""
+
+    def basis() -> dict[str, NDArray[Any]]:
+        found = fit_basis(
+            reader.rooted,
+            model,
+            job.seen_texels,
+            reader.sample_bytes_per_texel,
+            options,
+            workers=job.resources.workers,
+            seed=job.options.seed,
+        )
+        return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+
+    stored: dict[str, Any] = blocks.once(f"basis on the samples{part}", basis)
+    found = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
+    parts = blocks.map(
+        f"coefficients on the samples{part}",
+        coefficients_block,
+        SampleFit(reader, found, 0.0),
+        reader.blocks_of(job.seen_texels),
+    )
+    coefficients = found.coefficients.copy()
+    coefficients[job.seen_texels] = parts.joined("coefficients")
+    return replace(found, coefficients=coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleFit:
+    """What all blocks of texels share that are fitted to their samples.
+
+    Parameters
+    ----------
+    reader : TexelReader
+    model : ClusteredModel
+    spread : float
+        Of the frames, radians.
+    """
+
+    reader: TexelReader
+    model: ClusteredModel
+    spread: float
+
+
+def turned_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
+    """Frames of some texels, improved against the model."""
+    return {"frames": turned(context.reader, context.model, texels, context.spread)}
+
+
+def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
+    """Coefficients of some texels in the basis of the model."""
+    with ThreadPoolExecutor(1) as pool:
+        found, _ = solve_coefficients(
+            context.reader.rooted(texels),
+            context.model.cluster[texels],
+            context.model,
+            pool,
+            bounded=True,
+        )
+    return {"coefficients": found}

@@ -1,0 +1,342 @@
+"""Which photographs make the field and which it is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.capture import Capture
+from reflfield.errors import InputError
+from reflfield.options import HoldOut
+
+Indices = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+
+# Of views or lights with many photographs, so many are compared: more say nothing new.
+MOST_COMPARED = 64
+# Steps of this share of the lights leave the most even gaps, however many there are.
+GOLDEN_SHARE = (5**0.5 - 1) / 2
+# Which of the photographs that do not make the field it is compared with.
+BOTH, EITHER, CHOSEN, TEST = "both", "either", "photographs", "test"
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Photographs of a capture by what a run does with them.
+
+    Parameters
+    ----------
+    views, lights : (k,) int
+        Held out as a whole.
+    training_views, training_lights : (k,) int
+        Those that the field is made with.
+    trained, compared, aside : (k,) int
+        Indices into the capture's photographs, ascending, no two alike: these make the
+        field, these it is compared with, and these are used for neither.
+    kind : {"", "both", "either", "photographs", "test"}
+        What the compared ones are: of a held-out view and under a held-out light (where
+        views and lights are held out), of either, chosen one by one, or the capture's own
+        test split. Empty where nothing is held out.
+    """
+
+    views: Indices
+    lights: Indices
+    training_views: Indices
+    training_lights: Indices
+    trained: Indices
+    compared: Indices
+    aside: Indices
+    kind: str
+
+    def training(self, capture: Capture) -> Capture:
+        """The capture that the field is made of."""
+        kept = tuple(capture.photographs[i] for i in self.trained)
+        training = replace(capture, photographs=kept)
+        return training.subset(self.training_views, self.training_lights)
+
+    def frames(self, capture: Capture) -> Capture:
+        """The compared photographs, with their views and lights alone."""
+        kept = tuple(capture.photographs[i] for i in self.compared)
+        views = np.unique([p.camera for p in kept]).astype(np.intp)
+        lights = np.unique([p.light for p in kept]).astype(np.intp)
+        return replace(capture, photographs=kept).subset(views, lights)
+
+
+def split_of(capture: Capture, hold_out: HoldOut) -> Split:
+    """Decide what each photograph is used for.
+
+    Photographs of a held-out view, or under a held-out light, do not make the field. Where
+    both are held out it is compared with those of a held-out view under a held-out light;
+    a capture with one light for each view may have none such, and then with all of either.
+
+    Parameters
+    ----------
+    capture : Capture
+    hold_out : HoldOut
+
+    Returns
+    -------
+    Split
+
+    Raises
+    ------
+    InputError
+        If there are no photographs, or none would be left to make the field of, or the
+        capture has no test split.
+    """
+    view = np.array([p.camera for p in capture.photographs], np.intp)
+    light = np.array([p.light for p in capture.photographs], np.intp)
+    if not len(view):
+        raise InputError(f"{capture.name}: expected photographs, received none")
+    views = _spread(hold_out.views, np.unique(view), "views")
+    lights = _spread(hold_out.lights, np.unique(light), "lights")
+    removed, compared, kind = _removed(capture, hold_out, (view, light), (views, lights))
+    if removed.all():
+        raise InputError(
+            f"--hold-out {hold_out}: expected photographs left to make the field of, received "
+            f"none: all {len(view)} are held out; hold out fewer, or photographs=K"
+        )
+    return Split(
+        views,
+        lights,
+        np.flatnonzero(_kept_views(capture, view, removed)),
+        np.unique(light[~removed]),
+        np.flatnonzero(~removed),
+        np.flatnonzero(compared),
+        np.flatnonzero(removed & ~compared),
+        kind if removed.any() else "",
+    )
+
+
+def _spread(count: int, among: Indices, what: str) -> Indices:
+    return among[evenly_spread(count, len(among), what)]
+
+
+def _removed(
+    capture: Capture,
+    hold_out: HoldOut,
+    pairs: tuple[Indices, Indices],
+    held: tuple[Indices, Indices],
+) -> tuple[Bools, Bools, str]:
+    """Which photographs do not make the field, which are compared, and what those are."""
+    if hold_out.test:
+        chosen = _test_split(capture)
+        return chosen, chosen, TEST
+    if hold_out.photographs:
+        chosen = spread_photographs(*pairs, hold_out.photographs)
+        return chosen, chosen, CHOSEN
+    of_view, of_light = (np.isin(p, h) for p, h in zip(pairs, held, strict=True))
+    removed = of_view | of_light
+    both = (of_view | (len(held[0]) == 0)) & (of_light | (len(held[1]) == 0)) & removed
+    return removed, _thinned(both if both.any() else removed), BOTH if both.any() else EITHER
+
+
+def _test_split(capture: Capture) -> Bools:
+    test = np.zeros(len(capture.photographs), bool)
+    test[capture.test_split] = True
+    if not test.any():
+        raise InputError(
+            f"--hold-out test: expected a capture with a test split (transforms_test.json), "
+            f"{capture.description or capture.root} has none; use photographs=K, or "
+            "views=K,lights=K"
+        )
+    return test
+
+
+def _thinned(compared: Bools) -> Bools:
+    indices = np.flatnonzero(compared)
+    n = min(len(indices), MOST_COMPARED)
+    kept = np.zeros_like(compared)
+    kept[indices[np.linspace(0, len(indices) - 1, n).astype(int)]] = True
+    return kept
+
+
+def _kept_views(capture: Capture, view: Indices, removed: Bools) -> Bools:
+    """Views with photographs that make the field, or that have a silhouette to carve with."""
+    used, photographed = np.zeros((2, capture.n_views), bool)
+    used[view[~removed]], photographed[view] = True, True
+    carves = np.array([path is not None for path in capture.silhouettes], bool)
+    return used | (carves & ~photographed)
+
+
+def spread_photographs(views: Indices, lights: Indices, count: int) -> Bools:
+    """True for so many photographs, spread evenly over views and lights.
+
+    Along the one of which there are more, at even steps; along the other, at steps of the
+    golden ratio, to the nearest photograph that there is.
+
+    Parameters
+    ----------
+    views, lights : (n,) int
+        Of every photograph.
+    count : int
+        Fewer than n.
+
+    Returns
+    -------
+    (n,) bool
+
+    Raises
+    ------
+    InputError
+        If none would be left.
+
+    Examples
+    --------
+    Of eight photographs with a light of their own each, the third and the seventh:
+
+    >>> np.flatnonzero(spread_photographs(np.arange(8), np.arange(8), 2))
+    array([2, 6])
+    """
+    if count >= len(views):
+        raise InputError(
+            f"--hold-out: expected fewer than {_all_of(len(views), 'photographs')}, "
+            f"received {count}"
+        )
+    ranks = [np.unique(ids, return_inverse=True) for ids in (views, lights)]
+    first, second = sorted(ranks, key=lambda rank: -len(rank[0]))
+    share = (second[1] + 0.5) / len(second[0])
+    chosen = np.zeros(len(views), bool)
+    order = np.lexsort((lights, views))  # which decides between equally near ones
+    for k in range(count):
+        along = np.abs(first[1] - int((k + 0.5) * len(first[0]) / count))
+        across = np.abs(share - (k + 0.5) * GOLDEN_SHARE % 1)
+        distance = np.where(chosen, np.inf, along + 0.999 * across)
+        chosen[order[np.argmin(distance[order])]] = True
+    return chosen
+
+
+def _all_of(total: int, what: str) -> str:
+    return f"the only {what.removesuffix('s')}" if total == 1 else f"the {total} {what}"
+
+
+def evenly_spread(count: int, total: int, what: str) -> Indices:
+    """Indices of `count` of `total` things, evenly spread.
+
+    Raises
+    ------
+    InputError
+        If none would be left.
+
+    Examples
+    --------
+    >>> evenly_spread(2, 32, "views")
+    array([ 8, 24])
+    """
+    if count and count >= total:
+        raise InputError(
+            f"--hold-out: expected fewer than {_all_of(total, what)}, received {count}"
+        )
+    return ((np.arange(count) + 0.5) * total / max(count, 1)).astype(np.intp)
+
+
+# --- words --------------------------------------------------------------------------------
+
+
+def held_out_words(split: Split) -> str:
+    """One sentence on which photographs are compared and how many make the field.
+
+    Examples
+    --------
+    >>> one, none = np.array([3]), np.zeros(0, int)
+    >>> split = Split(none, none, none, none, np.arange(9), one, none, CHOSEN)
+    >>> held_out_words(split)
+    '1 photograph, spread over views and lights, is compared; 9 of 10 make the field'
+    """
+    n = len(split.trained)
+    total = n + len(split.compared) + len(split.aside)
+    if not split.kind:
+        return f"no photograph is held out; {n} of {total} make the field"
+    compared = counted(len(split.compared), "photograph")
+    are = "is" if len(split.compared) == 1 else "are"
+    parts = [f"{compared}{_which(split)} {are} compared"]
+    if len(split.aside):
+        parts.append(f"{len(split.aside)} others of those are used for neither")
+    return "; ".join([*parts, f"{n} of {total} make the field"])
+
+
+def held_out_counts(split: Split) -> dict[str, Any]:
+    """How many photographs were used for what, for ``metrics.json``."""
+    return {
+        "kind": split.kind or "nothing",
+        "photographs_compared": len(split.compared),
+        "photographs_used_for_neither": len(split.aside),
+        "photographs_of_the_field": len(split.trained),
+    }
+
+
+def _which(split: Split) -> str:
+    held = {"view": len(split.views), "light": len(split.lights)}
+    parts = [counted(n, f"held-out {what}") for what, n in held.items() if n]
+    return {
+        BOTH: f" of {' under '.join(parts)}",
+        EITHER: f" of {' or '.join(parts)}, none of them of both,",
+        CHOSEN: ", spread over views and lights,",
+        TEST: " of the capture's test split",
+    }[split.kind]
+
+
+def left_out_words(capture: Capture, split: Split) -> Iterator[str]:
+    """One sentence for each kind of camera or light that has no photograph, or none left.
+
+    Parameters
+    ----------
+    capture : Capture
+    split : Split
+        Of the capture.
+
+    Yields
+    ------
+    str
+    """
+    cameras = [camera.id for camera in capture.cameras]
+    photographed = np.unique([p.camera for p in capture.photographs])
+    without = np.setdiff1d(range(capture.n_views), photographed)
+    for indices, what in (
+        (
+            np.setdiff1d(np.setdiff1d(photographed, split.training_views), split.views),
+            "of which all photographs are held out; not in the hull either",
+        ),
+        (
+            np.intersect1d(without, split.training_views),
+            "without a photograph, of which only the silhouette is used",
+        ),
+        (
+            np.setdiff1d(without, split.training_views),
+            "without a photograph and a silhouette, left out",
+        ),
+    ):
+        if len(indices):
+            yield f"{counted(len(indices), 'camera')} {what}: {listed(cameras, indices)}"
+    dark = np.setdiff1d(range(capture.n_lights), [p.light for p in capture.photographs])
+    if len(dark):
+        names = listed([light.id for light in capture.lights], dark)
+        yield f"{counted(len(dark), 'light')} without a photograph, left out: {names}"
+
+
+def counted(n: int, what: str) -> str:
+    """A number of things.
+
+    Examples
+    --------
+    >>> counted(1, "view"), counted(3, "view")
+    ('1 view', '3 views')
+    """
+    return f"{n} {what}" + ("" if n == 1 else "s")
+
+
+def listed(names: Sequence[str], indices: Iterable[int], most: int = 6) -> str:
+    """The names at some indices, for a message: the first few.
+
+    Examples
+    --------
+    >>> listed(["a", "b", "c", "d"], [0, 2, 3], most=2)
+    "'a', 'c' and 1 more"
+    """
+    chosen = [repr(names[i]) for i in indices]
+    rest = f" and {len(chosen) - most} more" if len(chosen) > most else ""
+    return ", ".join(chosen[:most]) + rest

@@ -1,0 +1,253 @@
+"""What a run needs of memory at least, asked before anything is computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from reflfield.capture.capture import Capture
+from reflfield.capture.image_files import image_size
+from reflfield.errors import InputError
+from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.metrics.image_errors import PIXELS_AT_ONCE
+from reflfield.observations.store import (
+    SAMPLE_BYTES,
+    VIEWS_PER_CHUNK,
+    WRITER_BYTES,
+    chunk_shape,
+)
+from reflfield.options import Resources, gigabytes
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.texel_columns import COLUMNS_AT_ONCE
+from reflfield.render.renderer import RenderOptions
+
+# Libraries, compiled kernels and the code itself, measured.
+BASE_BYTES = 512 << 20
+# A pixel of a photograph while it is read: as stored, as float32, what of it was measured, and
+# the copy that is sampled or shown.
+PHOTOGRAPH_BYTES = 48
+# A pixel of a held-out photograph while it is compared and shown in the report; and of the
+# strip that is measured, besides.
+HELD_OUT_BYTES, STRIP_BYTES = 46, 500
+# What compiling the kernels of a first run leaves in memory, before frames are compared.
+COMPILED_BYTES = 400 << 20
+# A pixel of a silhouette while it is made from photographs.
+SILHOUETTE_BYTES = 80
+# A pixel of the signed distance to an outline.
+DISTANCE_BYTES = 4
+# Position, frames, area, quaternions: what is kept of a texel besides the arrays below.
+TEXEL_BYTES = 256
+# Columns of a block while they are inferred: resampled, by rows, clean, residual, weighted.
+COLUMN_COPIES = 6
+# A writer's samples, while they are cut into chunks and encoded.
+WRITER_COPIES = 2
+# Largest share of a texture that charts cover.
+LARGEST_USE = 0.8
+
+
+def least_memory(job: Job) -> int:
+    """Bytes that the run holds at the same time however small its blocks are.
+
+    Of every view which of its pixels are covered, what is made of the largest image, and the
+    samples that are written together; or what is kept of every texel with the samples of one
+    view under all lights, and one block of each thread or the columns of one: whichever is
+    more.
+    """
+    training = job.training
+    pixels = [camera.width * camera.height for camera in training.cameras]
+    held = [camera.width * camera.height for camera in job.held_frames.cameras]
+    made = any(path is None for path in training.silhouettes)
+    largest = max(
+        max(PHOTOGRAPH_BYTES, SILHOUETTE_BYTES * made) * max(pixels),
+        compared_bytes(max(held, default=0)),
+    )
+    texels, n_lights = most_texels(job), training.n_lights
+    samples = min(WRITER_BYTES, VIEWS_PER_CHUNK * texels * n_lights * SAMPLE_BYTES)
+    images = sum(pixels) // 8 + largest + texels * TEXEL_BYTES + WRITER_COPIES * samples
+    rank = max(job.options.completion.rank, job.options.compression.rank)
+    each = TEXEL_BYTES + training.n_views + 7 * training.n_lights + 12 * rank
+    blocks = job.resources.workers * job.resources.block_bytes
+    columns = columns_bytes(job.sides[0] ** 2 * job.sides[1] ** 2)
+    return BASE_BYTES + max(images, texels * each + max(blocks, columns))
+
+
+def compared_bytes(pixels: int) -> int:
+    """Memory of a held-out photograph while it is compared, with the kernels compiled by then.
+
+    Examples
+    --------
+    >>> compared_bytes(0)
+    0
+    """
+    strip = STRIP_BYTES * min(pixels, PIXELS_AT_ONCE)
+    return HELD_OUT_BYTES * pixels + strip + COMPILED_BYTES if pixels else 0
+
+
+def keeps_distances(job: Job) -> bool:
+    """Whether the distances to the outlines of all views may stay in memory."""
+    pixels = sum(camera.width * camera.height for camera in job.training.cameras)
+    return DISTANCE_BYTES * pixels <= job.resources.max_memory // 8
+
+
+def silhouettes_at_once(job: Job) -> int:
+    """Threads that may each make a silhouette at a time."""
+    most = max(camera.width * camera.height for camera in job.training.cameras)
+    return int(max(1, (job.resources.max_memory - BASE_BYTES) // (SILHOUETTE_BYTES * most)))
+
+
+def most_texels(job: Job) -> int:
+    """Upper bound on the texels of the run, known before there is a surface."""
+    if job.is_plane:
+        camera = job.capture.cameras[0]
+        return camera.width * camera.height
+    side = job.options.atlas.resolution or job.options.texture.largest
+    return int(LARGEST_USE * side**2)
+
+
+def check_memory(job: Job) -> None:
+    """Refuse a ceiling that cannot be met.
+
+    Raises
+    ------
+    InputError
+        Naming what would suffice.
+    """
+    least, given = least_memory(job), job.resources.max_memory
+    if least > given:
+        raise InputError(
+            f"--max-memory: expected at least {gigabytes(least + (1 << 26))} for "
+            f"{job.training.n_views} views, {job.training.n_lights} lights and up to "
+            f"{most_texels(job)} texels, received {gigabytes(given)}; raise it, or lower "
+            "texture.largest"
+        )
+
+
+def columns_bytes(n_pairs: int) -> int:
+    """Memory of one block of columns while their coefficients are inferred."""
+    return COLUMN_COPIES * COLUMNS_AT_ONCE * 12 * n_pairs
+
+
+def columns_at_once(resources: Resources, n_pairs: int) -> int:
+    """Threads that may each infer coefficients of a block of columns at a time."""
+    return int(max(1, (resources.max_memory - BASE_BYTES) // (2 * columns_bytes(n_pairs))))
+
+
+def writers_at_once(job: Job) -> int:
+    """Threads that may each hold the samples of a few views, and photographs, at a time."""
+    n_texels, n_views, n_lights = (len(job.texels), job.training.n_views, job.training.n_lights)
+    views = chunk_shape(n_texels, n_views, n_lights)[1]
+    samples = views * n_texels * n_lights * SAMPLE_BYTES
+    pixels = max(camera.width * camera.height for camera in job.training.cameras)
+    photographs = max(WRITER_COPIES * job.resources.block_bytes, PHOTOGRAPH_BYTES * pixels)
+    free = job.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES
+    return int(max(1, free // (WRITER_COPIES * samples + photographs)))
+
+
+# --- pictures outside of a run -------------------------------------------------------------
+
+# A pixel of a picture while it is rendered and written: radiance, coverage, both, a copy.
+PICTURE_BYTES = 64
+# A pixel of a photograph beside it: as stored, linear, what of it is measured; the picture
+# read again, silhouette and masks.
+COMPARED_BYTES = 96
+# A pixel of a turntable's frame, all of which are kept: half floats, encoded, animated.
+FRAME_BYTES = 13
+# A pixel of an environment map while it is read.
+MAP_BYTES = 28
+# Texel of a field that is rendered, besides its components: frame, point, normal, owner.
+RENDERED_TEXEL_BYTES = 160
+
+
+def field_bytes(field: ReflectanceField, n_directions: int) -> int:
+    """Memory of a field, decoded for pictures, with its shadows under so many directions."""
+    shapes = {name: array.shape for name, array in field.arrays.items()}
+    n_clusters, n_functions, _ = shapes["function_factor"]
+    nodes = shapes["view_factor"][0] * shapes["light_factor"][0]
+    texel = RENDERED_TEXEL_BYTES + 8 * n_functions + n_directions // 8
+    # The table once as it is decoded and once as it is kept.
+    return 2 * 12 * n_clusters * nodes * n_functions + shapes["cluster"][0] * texel
+
+
+def check_picture_memory(
+    field: ReflectanceField,
+    resources: Resources,
+    options: RenderOptions,
+    *,
+    pixels: int,
+    pixel_bytes: int = PICTURE_BYTES,
+    kept_pixels: int = 0,
+    map_pixels: int = 0,
+) -> RenderOptions:
+    """Options with which pictures stay below a ceiling of memory; they look the same.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    resources : Resources
+    options : RenderOptions
+    pixels : int
+        Of the largest picture.
+    pixel_bytes : int
+        Memory of one of them.
+    kept_pixels : int
+        Of all frames of a turntable.
+    map_pixels : int
+        Of the largest environment map.
+
+    Returns
+    -------
+    RenderOptions
+        With blocks that all threads together can work on.
+
+    Raises
+    ------
+    InputError
+        If the ceiling cannot be met, naming what would suffice.
+    """
+    fitting = within_memory(options, resources)
+    blocks = fitting.workers * fitting.block_pixels * RAY_BYTES * options.samples_per_pixel
+    pictures = pixels * pixel_bytes + kept_pixels * FRAME_BYTES
+    directions = options.environment_directions if map_pixels else 0
+    least = BASE_BYTES + field_bytes(field, directions) + map_pixels * MAP_BYTES
+    least += blocks + pictures
+    if least > resources.max_memory:
+        frames = f" and {kept_pixels} in all" if kept_pixels else ""
+        received = gigabytes(resources.max_memory)
+        raise InputError(
+            f"--max-memory: expected at least {gigabytes(least + (1 << 26))} for pictures of "
+            f"{pixels} pixels{frames}, received {received}; raise it, or make the pictures, "
+            "their number or the map smaller"
+        )
+    return fitting
+
+
+def check_frames_memory(
+    field: ReflectanceField,
+    frames: Capture,
+    options: RenderOptions,
+    resources: Resources,
+    *,
+    compared: bool = False,
+) -> RenderOptions:
+    """`check_picture_memory` of the largest frame and map of some frames."""
+    maps = [s.file for light in frames.lights for s in light.sources if s.file is not None]
+    sizes = [image_size(path) for path in maps]
+    return check_picture_memory(
+        field,
+        resources,
+        options,
+        pixels=max((c.width * c.height for c in frames.cameras), default=0),
+        pixel_bytes=PICTURE_BYTES + compared * COMPARED_BYTES,
+        map_pixels=max((width * height for width, height in sizes), default=0),
+    )
+
+
+# Memory of one ray through a pixel: hits, footprints of up to twelve texels, radiance.
+RAY_BYTES = 4096
+
+
+def within_memory(options: RenderOptions, resources: Resources) -> RenderOptions:
+    """Blocks of pixels that all threads together can work on; the pictures stay the same."""
+    each = RAY_BYTES * options.samples_per_pixel
+    workers = options.workers or resources.workers
+    fits = max(4 * resources.block_bytes // (workers * each), 64)
+    return replace(options, workers=workers, block_pixels=min(options.block_pixels, fits))

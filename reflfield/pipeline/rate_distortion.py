@@ -1,0 +1,95 @@
+"""Stage that shows what bits bring: the fitted models quantised more and more coarsely."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.file import PackedSizes
+from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.metrics.held_out_photographs import compare_with_photographs
+from reflfield.metrics.image_metrics import NothingToMeasure
+from reflfield.pipeline.comparison import (
+    MAIN,
+    frame_sets,
+    silhouettes_of_frames,
+    variants,
+)
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.memory import within_memory
+from reflfield.pipeline.quantising import FieldMaker
+from reflfield.report.sections import RatePoint
+from reflfield.util.progress import track
+
+# Steps over the residual of the fit.
+COARSENESS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+CURVES = {MAIN: "with alignment", "without_alignment": "without alignment"}
+PAPER = "half floats, not factored"
+POINTS = "points.json"
+
+
+def write_rate_distortion(job: Job, folder: Path) -> dict[str, Any]:
+    """Size and quality of every model at every step, and in the layout of the paper."""
+    todo = [(v, stage, c) for v, stage in variants(job).items() for c in COARSENESS]
+    maker, sizes, points = FieldMaker(job, job.options.compression, {}), PackedSizes(), []
+    for variant, stage, coarseness in track(todo, len(todo), "quality against size"):
+        model, frames = stored_model(job, stage)
+        field = maker.build(model, frames, coarseness * model.residuals[-1])
+        points.append(_point(job, maker, field, CURVES[variant], sizes.of(field)))
+    model, frames = stored_model(job, "compression")
+    exact = maker.build(model, frames, 0.0)
+    points.append(_point(job, maker, exact, PAPER, unfactored_bytes(exact, sizes)))
+    (folder / POINTS).write_text(json.dumps([asdict(point) for point in points], indent=1))
+    return {"fields": len(points)}
+
+
+def stored_points(job: Job) -> list[RatePoint]:
+    """What the stage has written."""
+    stored = json.loads((job.stages.root / "rate_distortion" / POINTS).read_text())
+    return [RatePoint(**point) for point in stored]
+
+
+def stored_model(job: Job, stage: str) -> tuple[ClusteredModel, NDArray[np.float32]]:
+    """Model of a compression stage before it was quantised, and its frames."""
+    arrays: dict[str, Any] = job.result(stage, "model.npz")
+    frames = arrays.pop("local_from_world")
+    residuals = tuple(arrays.pop("residuals").tolist())
+    return ClusteredModel(**arrays, residuals=residuals), frames
+
+
+def unfactored_bytes(field: ReflectanceField, sizes: PackedSizes) -> int:
+    """Size with mean, basis and coefficients as halves and frames as four, as in the paper.
+
+    Surface and clusters as in ours; nothing else is packed.
+    """
+    a_texel = 2 * (field.n_components + 4)
+    functions = 2 * (field.mean.size + field.basis.size)
+    surface = ("positions", "faces", "uv", "texel_of_pixel", "cluster")
+    shared = sum(sizes.array_bytes(name, field.arrays[name]) for name in surface)
+    return field.n_texels * a_texel + functions + shared
+
+
+def _point(
+    job: Job, maker: FieldMaker, field: ReflectanceField, curve: str, size: int
+) -> RatePoint:
+    heldout = None
+    sets = frame_sets(job)
+    if "heldout" in sets:
+        options = within_memory(job.options.relighting, job.resources)
+        with TemporaryDirectory() as scratch:
+            frames = sets["heldout"]
+            silhouettes = silhouettes_of_frames(job, "heldout", frames)
+            try:
+                heldout = compare_with_photographs(
+                    field, frames, silhouettes, Path(scratch), options
+                ).mean["psnr_ldr"]
+            except NothingToMeasure:
+                heldout = None
+    return RatePoint(curve, size, maker.quality(field), heldout)

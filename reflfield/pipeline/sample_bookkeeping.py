@@ -1,0 +1,149 @@
+"""Where every photograph, sample and texel of a run has gone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from reflfield.pipeline import comparison
+from reflfield.pipeline.context import Job
+from reflfield.report.sections import Account
+
+
+def accounts_of(job: Job) -> Iterator[Account]:
+    """Count what went into each stage of a finished run, and what became of it.
+
+    Totals come from the capture and the texel table, parts from what the stages have
+    recorded or left: a stage that loses something does not add up.
+
+    Parameters
+    ----------
+    job : Job
+        With its stages done up to the comparison.
+
+    Yields
+    ------
+    Account
+    """
+    counts = {record.name: record.counts for record in job.stages.records}
+    yield _photographs(job, counts["observations"])
+    yield _values(job, counts["observations"])
+    yield _samples(job, counts)
+    yield from _texels(job, counts)
+    yield _frames(job)
+
+
+def _photographs(job: Job, projected: dict[str, Any]) -> Account:
+    """Photographs of the capture: projected, held out and compared, or neither."""
+    return Account(
+        "observations",
+        "photographs",
+        len(job.capture.photographs),
+        {
+            "projected onto the surface": projected["photographs"],
+            "held out and compared": len(job.held_frames.photographs),
+            "of a held-out view or light, used for neither": len(job.split.aside),
+        },
+    )
+
+
+def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
+    """One sample for each texel and photograph: fitted, unseen, shadowed, below the horizon."""
+    observed, pairs = job.observed, job.observed.pairs.astype(np.float32)
+    seen = observed.views.astype(np.float32) @ pairs
+    shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
+    unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
+    used = counts["compression"]["samples fitted"]
+    unmeasured = counts["compression"]["samples not measured"]
+    shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
+    mixed = shade["samples at edges of shadows"]
+    shown = shade["samples in shadow"] - mixed
+    return Account(
+        "compression",
+        "samples",
+        len(job.texels) * len(job.training.photographs),
+        {
+            "fitted": used,
+            "texel not seen by the camera": int(unseen),
+            "in shadow: fitted as indirect light": shown,
+            "in shadow: at its edge": mixed,
+            "in shadow: nothing made of them": int(shadowed) - shown - mixed,
+            "not measured in any channel": unmeasured,
+            "below the horizon of the texel's frame, or outside the light's cone": counts[
+                "completion"
+            ]["samples observed"]
+            - used
+            - unmeasured,
+        },
+    )
+
+
+def _values(job: Job, projected: dict[str, Any]) -> Account:
+    """Three values for each photograph and texel that its camera sees: measured or not."""
+    pairs = job.observed.pairs.sum(axis=1)
+    names = {
+        "measured": "measured",
+        "saturated": "saturated: left out",
+        "black": "at code 0: taken for what is too dark for the file",
+        "transparent": "under alpha 0: left out",
+        "dark": "of a colour that the light has not: left out",
+        "unlit": "the light gives nothing there",
+    }
+    return Account(
+        "observations",
+        "values",
+        3 * int(job.view_seen.sum(axis=0) @ pairs),
+        {name: projected[f"values {kind}"] for kind, name in names.items()},
+    )
+
+
+def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
+    """Texels of the atlas through completion, alignment and compression."""
+    n = len(job.texels)
+    completed = counts["completion"]
+    unseen = completed["texels without samples"]
+    yield Account(
+        "completion",
+        "texels",
+        n,
+        {"completed": completed["texels completed"], "without samples": unseen},
+    )
+    aligned = counts["alignment"]
+    yield Account(
+        "alignment",
+        "texels",
+        n,
+        {
+            "frame found": aligned["texels aligned"],
+            "keep the base frame": aligned["texels that keep the base frame"],
+            "without samples": unseen,
+        },
+    )
+    fitted = counts["compression"]
+    yield Account(
+        "compression",
+        "texels",
+        n,
+        {
+            "fitted to their samples": fitted["texels fitted"],
+            "repeat the nearest that is": fitted["texels that repeat another"],
+        },
+    )
+
+
+def _frames(job: Job) -> Account:
+    """Frames that are compared, from the metrics that were written."""
+    names = {"heldout": "held out", "truth": "unseen and simulated"}
+    sets, parts = comparison.frame_sets(job), {}
+    for name, frames in sets.items():
+        measured = comparison.comparison_of(job, name)
+        if measured is None:
+            parts[f"{names[name]}, not compared"] = len(frames.photographs)
+            continue
+        parts[f"{names[name]}, measured"] = len(measured.frames)
+        if measured.not_measured:
+            parts[f"{names[name]}, without an object pixel"] = len(measured.not_measured)
+    total = sum(len(frames.photographs) for frames in sets.values())
+    return Account("comparison", "frames", total, parts)

@@ -1,0 +1,133 @@
+"""Relighting and comparison of a field with any frames, outside a run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from reflfield.capture.capture import Capture
+from reflfield.errors import InputError
+from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.geometry.mesh import Mesh
+from reflfield.metrics.comparison_silhouettes import write_frame_silhouettes
+from reflfield.metrics.held_out_photographs import RelitPairs, compare_with_photographs
+from reflfield.metrics.image_metrics import Comparison, metrics_text
+from reflfield.render.relit_photographs import relight_frames
+from reflfield.render.renderer import RenderOptions
+from reflfield.report import sections
+from reflfield.report.page import ReportContent, write_report
+from reflfield.util.files import filling
+
+
+def write_relit_frames(
+    field: ReflectanceField, frames: Capture, out: Path, options: RenderOptions
+) -> list[Path]:
+    """Relight frames; all files, or none after an error.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    frames : Capture
+        Whose photographs are not read, and need not be there.
+    out : Path
+        Gets NAME.exr and NAME.png of every frame.
+    options : RenderOptions
+
+    Returns
+    -------
+    list of Path
+        The EXR files, in the order of the frames.
+
+    Raises
+    ------
+    InputError
+        If a frame cannot be relit, or a file of the frames would be replaced.
+    """
+    check_kept(frames, _pictures(frames, out))
+    with filling(out) as partial:
+        made = [frame.exr for frame in relight_frames(field, frames, partial, options)]
+    return [out / path.name for path in made]
+
+
+def write_standalone_comparison(
+    field: ReflectanceField, frames: Capture, out: Path, options: RenderOptions
+) -> Comparison:
+    """Relight frames, measure them, and write pictures, ``metrics.json`` and a page.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    frames : Capture
+        With photographs. Views without a silhouette get one made from their photographs if
+        they are enough, else the field's own surface as the camera sees it.
+    out : Path
+        Gets ``relit/``, ``metrics.json`` and ``report/index.html``: all, or nothing after an
+        error.
+    options : RenderOptions
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If no frame can be compared, or a file of the frames would be replaced.
+    NumericalError
+        If what the field shows is not finite.
+    """
+    pages = [out / "metrics.json", out / "report" / "index.html"]
+    check_kept(frames, [*pages, *_pictures(frames, out / "relit")])
+    with TemporaryDirectory() as scratch, filling(out) as partial:
+        silhouettes = write_frame_silhouettes(
+            frames, frames, Mesh(field.positions, field.faces), Path(scratch), options.workers
+        )
+        comparison = compare_with_photographs(
+            field, frames, silhouettes, partial / "relit", options
+        )
+        pairs = RelitPairs(frames, partial / "relit", silhouettes).measured_in(comparison)
+        (partial / "metrics.json").write_text(metrics_text(comparison.to_dict()))
+        write_report(partial / "report" / "index.html", _page(field, comparison, pairs))
+    return comparison
+
+
+def _page(field: ReflectanceField, comparison: Comparison, pairs: RelitPairs) -> ReportContent:
+    return ReportContent(
+        title=f"{field.metadata.get('capture', 'field')} against {pairs.frames.name}",
+        subtitle=f"{len(pairs)} frames",
+        key_numbers=sections.key_numbers(comparison),
+        sections=(
+            sections.frames_section(
+                comparison,
+                pairs,
+                title="Frames",
+                intro="Photographs beside what the field predicts for them.",
+            ),
+        ),
+    )
+
+
+def _pictures(frames: Capture, folder: Path) -> list[Path]:
+    names = [photograph.name for photograph in frames.photographs]
+    return [folder / f"{name}.{kind}" for name in names for kind in ("exr", "png")]
+
+
+def check_kept(frames: Capture, written: Iterable[Path]) -> None:
+    """Refuse to write over files that frames are read from.
+
+    Raises
+    ------
+    InputError
+        Naming the first of them.
+    """
+    read = {e.path.resolve() for p in frames.photographs for e in p.exposures}
+    read |= {path.resolve() for path in frames.silhouettes if path is not None}
+    read |= {light.file.resolve() for light in frames.lights if light.file is not None}
+    for path in written:
+        if Path(os.path.realpath(path)) in read:
+            raise InputError(
+                f"{path}: expected a folder for results where no file of the frames is "
+                "replaced, received one with this file; choose another folder"
+            )

@@ -1,0 +1,118 @@
+"""Frames relit: each with its own camera and its own light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from reflfield.capture.capture import Capture
+from reflfield.capture.image_files import read_image
+from reflfield.capture.image_writing import write_exr, write_png
+from reflfield.errors import InputError
+from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.render.exposure import common_exposure, covered_luminances, encoded_picture
+from reflfield.render.renderer import Renderer, Rendering, RenderOptions
+from reflfield.util.progress import track
+
+
+@dataclass(frozen=True)
+class RelitFrame:
+    """One relit frame.
+
+    Parameters
+    ----------
+    name : str
+        The photograph's file stem.
+    rendering : Rendering
+        Picture and coverage.
+    exr, png : Path
+        Files: linear radiance (channels R, G, B and coverage as A), and the
+        picture at the common exposure. The PNG is written after the last frame.
+    """
+
+    name: str
+    rendering: Rendering
+    exr: Path
+    png: Path
+
+
+def relight_frames(
+    field: ReflectanceField,
+    frames: Capture,
+    out_dir: Path | str,
+    options: RenderOptions | None = None,
+    *,
+    exposure: float | None = None,
+) -> Iterator[RelitFrame]:
+    """Relight every frame of a capture and write NAME.exr and NAME.png.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+        What to show.
+    frames : Capture
+        Cameras, lights and names, as `open_capture(path,
+        require_photographs=False)` reads them; the photographs are not read.
+    out_dir : Path or str
+        Folder to write to; made if absent.
+    options : RenderOptions, optional
+        Samples, threads.
+    exposure : float, optional
+        Factor before the sRGB encoding of the PNGs. By default one for all
+        frames: 1 / the 99.5th percentile of the luminance of the object's pixels over
+        all frames, so frames can be compared by eye.
+
+    Yields
+    ------
+    RelitFrame
+        In the order of the frames. Their PNGs are written when the last one
+        has been taken, because their common exposure is known only then.
+
+    Raises
+    ------
+    InputError
+        If two frames have one name, or a light is unknown.
+    """
+    _check_names(frames)
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    renderer = Renderer(field, options)
+    relit, luminances = [], []
+    total = len(frames.photographs)
+    for photograph in track(frames.photographs, total, "relighting"):
+        camera, light = frames.cameras[photograph.camera], frames.lights[photograph.light]
+        rendering = renderer.render(camera, light)
+        frame = RelitFrame(
+            photograph.name,
+            rendering,
+            folder / f"{photograph.name}.exr",
+            folder / f"{photograph.name}.png",
+        )
+        write_exr(frame.exr, _with_coverage(rendering), names=["R", "G", "B", "A"])
+        luminances.append(covered_luminances(rendering.image, rendering.coverage))
+        relit.append((frame.exr, frame.png))
+        yield frame
+    factor = common_exposure(luminances) if exposure is None else exposure
+    for exr, png in relit:
+        write_png(png, encoded_picture(read_image(exr), factor))
+
+
+def _with_coverage(rendering: Rendering) -> np.ndarray:
+    return np.concatenate([rendering.image, rendering.coverage[..., None]], axis=2)
+
+
+def _check_names(frames: Capture) -> None:
+    seen: set[str] = set()
+    for photograph in frames.photographs:
+        name = photograph.name
+        if name in seen:
+            raise InputError(
+                f"frames: expected one frame of each name, received {name!r} twice; "
+                "the second would overwrite the first"
+            )
+        if Path(name).name != name:
+            raise InputError(f"frames: expected names without folders, received {name!r}")
+        seen.add(name)

@@ -1,0 +1,1 @@
+"""The HTML report, its plots and its pictures."""

@@ -1,0 +1,65 @@
+"""The usual sections of a report, from plain arrays and counts.
+
+Every builder returns a `Section`; the pipeline composes them in its order and
+leaves out those whose input a run does not have.
+"""
+
+from reflfield.report.sections.alignment_gain import FieldVariant, ablation_section
+from reflfield.report.sections.base_surface import (
+    SilhouetteView,
+    atlas_section,
+    coverage_section,
+    normals_section,
+    silhouettes_section,
+)
+from reflfield.report.sections.candidate_runs import (
+    TriedField,
+    choices_section,
+    rules_section,
+)
+from reflfield.report.sections.held_out_images import (
+    alignment_section,
+    comparisons_table,
+    frames_section,
+    metrics_table,
+)
+from reflfield.report.sections.run_summary import (
+    StageRecord,
+    compression_section,
+    key_numbers,
+    run_section,
+    stages_section,
+)
+from reflfield.report.sections.sample_counts import Account, accounts_section
+from reflfield.report.sections.size_and_quality import (
+    RatePoint,
+    rate_distortion_section,
+)
+from reflfield.report.sections.truth_scores import truth_section
+
+__all__ = [
+    "Account",
+    "FieldVariant",
+    "RatePoint",
+    "SilhouetteView",
+    "StageRecord",
+    "TriedField",
+    "ablation_section",
+    "accounts_section",
+    "alignment_section",
+    "atlas_section",
+    "choices_section",
+    "comparisons_table",
+    "compression_section",
+    "coverage_section",
+    "frames_section",
+    "key_numbers",
+    "metrics_table",
+    "normals_section",
+    "rate_distortion_section",
+    "rules_section",
+    "run_section",
+    "silhouettes_section",
+    "stages_section",
+    "truth_section",
+]

@@ -1,0 +1,321 @@
+"""Sections on the surface: silhouettes, atlas, coverage, normals."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.metrics.image_metrics import (
+    COVERAGE_OF_OBJECT,
+)
+from reflfield.report import pictures, plots
+from reflfield.report.page import (
+    Cell,
+    ColourBar,
+    Figure,
+    Item,
+    Panel,
+    Picture,
+    Section,
+    Table,
+    encode_picture,
+)
+
+SHEET_PX = 360
+ATLAS_PX = 720
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteView:
+    """One view for `silhouettes_section`.
+
+    Attributes
+    ----------
+    name : str
+    photograph : (h, w, 3) float
+        Linear radiance; any light.
+    silhouette, hull_silhouette : (h, w) float
+        Coverage as photographed, and of the hull seen by the same camera.
+    """
+
+    name: str
+    photograph: NDArray[Any]
+    silhouette: NDArray[Any]
+    hull_silhouette: NDArray[Any]
+
+
+def silhouettes_section(
+    views: Iterable[SilhouetteView],
+    *,
+    origin: str = "",
+    max_pictures: int = 12,
+    left_out: Collection[str] = (),
+) -> Section:
+    """Silhouettes against the hull: outlines over photographs, agreement per view.
+
+    Parameters
+    ----------
+    views : iterable of SilhouetteView
+        Read once, one at a time.
+    origin : str
+        Where the silhouettes came from, such as "found by GrabCut".
+    max_pictures : int
+        Views that agree least are shown.
+    left_out : collection of str
+        Names of views that the hull is made without.
+
+    Returns
+    -------
+    Section
+    """
+    seen = [(_agreement(view), _overlay(view)) for view in views]
+    seen.sort(key=lambda entry: (entry[0][1], entry[0][0]))
+    panels = tuple(
+        Panel(picture, f"{row[0]} · IoU {row[1]:.3f}") for row, picture in seen[:max_pictures]
+    )
+    figure = Figure(
+        panels,
+        "The views that agree least come first. The two lines should coincide. Red areas were "
+        "carved away although the photograph shows object there (a wrong camera, or a "
+        "silhouette that is too small in another view); yellow areas are hull where the "
+        "photograph shows none.",
+        legend=_legend(
+            (pictures.SILHOUETTE_COLOUR, "silhouette"),
+            (pictures.HULL_COLOUR, "hull"),
+            (pictures.MISSING_COLOUR, "missing from the hull"),
+            (pictures.EXCESS_COLOUR, "hull beyond the silhouette"),
+        ),
+    )
+    table = Table(
+        ("view", "IoU", "missing, %", "beyond, %"),
+        tuple(
+            (
+                _marked(name, left_out),
+                f"{iou:.4f}",
+                f"{100 * missing:.2f}",
+                f"{100 * beyond:.2f}",
+            )
+            for (name, iou, missing, beyond), _ in seen
+        ),
+        "Agreement per view: intersection over union; area missing from the hull and area "
+        "beyond the silhouette, in percent of the silhouette.",
+    )
+    intro = f"Do cameras, silhouettes and hull fit together? Silhouettes: {origin or 'given'}."
+    return Section("Silhouettes and hull", intro, (figure, table))
+
+
+def _marked(name: str, left_out: Collection[str]) -> str:
+    """Name of a view, with a remark if the hull is made without it."""
+    return f"{name} (the hull is made without it)" if name in left_out else name
+
+
+def _agreement(view: SilhouetteView) -> tuple[str, float, float, float]:
+    seen, hull = _covered(view.silhouette), _covered(view.hull_silhouette)
+    area, union = max(1, int(seen.sum())), max(1, int((seen | hull).sum()))
+    missing, beyond = int((seen & ~hull).sum()), int((hull & ~seen).sum())
+    return view.name, int((seen & hull).sum()) / union, missing / area, beyond / area
+
+
+def _covered(silhouette: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.asarray(silhouette >= COVERAGE_OF_OBJECT)
+
+
+def _overlay(view: SilhouetteView) -> Picture:
+    covered = _covered(view.silhouette)
+    hull = _covered(view.hull_silhouette)
+    box = pictures.bounding_box(covered | hull, margin=8)
+    photograph, seen = np.asarray(view.photograph)[box], covered[box]
+    exposure = pictures.exposure_for(photograph, seen)
+    # Outlines are one pixel wide; on small photographs that would hide the gaps.
+    factor = max(1, SHEET_PX // max(seen.shape))
+    painted = pictures.silhouettes_overlay(
+        pictures.enlarged(pictures.tonemapped(photograph, exposure), factor),
+        pictures.enlarged(np.asarray(view.silhouette)[box], factor),
+        pictures.enlarged(np.asarray(view.hull_silhouette)[box], factor),
+    )
+    return encode_picture(pictures.fitted(painted, SHEET_PX))
+
+
+def atlas_section(
+    texel_of_pixel: ArrayLike,
+    charts: ArrayLike,
+    mean_sample: ArrayLike,
+    facts: Mapping[str, Cell] | None = None,
+) -> Section:
+    """Atlas: layout by chart, mean texture, and facts about it.
+
+    Parameters
+    ----------
+    texel_of_pixel : (h, w) array_like of int
+        -1 for none.
+    charts : (n_texels,) array_like of int
+        Chart of each texel.
+    mean_sample : (n_texels, 3) array_like
+        Mean apparent reflectance of each texel, linear; NaN where unobserved.
+    facts : mapping, optional
+        Such as ``{"charts": 7, "texels": 65536, "stretch": 1.1}``.
+
+    Returns
+    -------
+    Section
+    """
+    colours = np.asarray(mean_sample, dtype=np.float64)
+    seen = np.isfinite(colours).all(axis=-1)
+    exposure = pictures.exposure_for(colours, seen)
+    layout = pictures.texture(np.asarray(charts), texel_of_pixel, nothing=-1)
+    figure = Figure(
+        (
+            _atlas_panel(pictures.labels_coloured(layout), texel_of_pixel, "charts"),
+            _atlas_panel(
+                pictures.tonemapped(pictures.texture(colours, texel_of_pixel), exposure),
+                texel_of_pixel,
+                "mean over all views and lights",
+            ),
+        ),
+        "Charts should be few and large. The mean texture should be sharp: details seen double "
+        "or blurred point to wrong cameras or a hull that bridges hollows. Grey texels were "
+        "never observed.",
+        min_width=280,
+    )
+    items: list[Item] = [figure]
+    if facts:
+        items.append(Table(("quantity", "value"), tuple(facts.items()), "Atlas in numbers."))
+    intro = "How the surface was cut and flattened, and what was projected onto it."
+    return Section("Atlas", intro, tuple(items))
+
+
+def coverage_section(
+    texel_of_pixel: ArrayLike, views_per_texel: ArrayLike, lights_per_texel: ArrayLike
+) -> Section:
+    """Coverage: how many views and lights each texel was observed with.
+
+    Parameters
+    ----------
+    texel_of_pixel : (h, w) array_like of int
+    views_per_texel, lights_per_texel : (n_texels,) array_like of int
+
+    Returns
+    -------
+    Section
+    """
+    counts = {"views": np.asarray(views_per_texel), "lights": np.asarray(lights_per_texel)}
+    items: list[Item] = [_count_figure(texel_of_pixel, k, v) for k, v in counts.items()]
+    items.append(
+        Table(
+            ("per texel", "none, % of texels", "median", "mean", "most"),
+            tuple(
+                (
+                    k,
+                    f"{100 * np.mean(v == 0):.2f}",
+                    float(np.median(v)),
+                    f"{v.mean():.1f}",
+                    int(v.max()),
+                )
+                for k, v in counts.items()
+                if v.size
+            ),
+            "Texels without any view are filled from similar ones and are a guess.",
+        )
+    )
+    intro = (
+        "What the data say about each texel; everything else is completed from other texels."
+    )
+    return Section("Coverage", intro, tuple(items))
+
+
+def _count_figure(texel_of_pixel: ArrayLike, name: str, counts: NDArray[Any]) -> Figure:
+    most = max(1, int(counts.max(initial=1)))
+    laid_out = pictures.texture(counts.astype(np.float64), texel_of_pixel)
+    plot = plots.histogram(
+        {name: counts}, f"{name} per texel", "texels, %", limits=(-0.5, most + 0.5),
+        n_bins=min(most + 1, 60),
+    )  # fmt: skip
+    return Figure(
+        (
+            _atlas_panel(
+                pictures.false_colour(laid_out, 0, most), texel_of_pixel, f"{name} per texel"
+            ),
+            Panel(plot, f"distribution of {name} per texel"),
+        ),
+        f"Dark regions were observed with few {name}; look for them in hollows and underneath.",
+        colour_bar=ColourBar("viridis", 0, most, f"{name} per texel"),
+        min_width=280,
+    )
+
+
+def normals_section(
+    texel_of_pixel: ArrayLike,
+    local_from_world: ArrayLike,
+    base_from_world: ArrayLike,
+) -> Section:
+    """Recovered frames of reference: normals and tangents, and how far they turned.
+
+    Parameters
+    ----------
+    texel_of_pixel : (h, w) array_like of int
+    local_from_world, base_from_world : (n_texels, 3, 3) array_like
+        Aligned frames and frames of the base geometry; rows tangent, binormal,
+        normal.
+
+    Returns
+    -------
+    Section
+    """
+    local = np.asarray(local_from_world, dtype=np.float64)
+    base = np.asarray(base_from_world, dtype=np.float64)
+    # The recovered normal and tangent in the texel's base frame.
+    normal = np.einsum("nij,nj->ni", base, local[:, 2])
+    tangent = np.einsum("nij,nj->ni", base, local[:, 0])
+    tilt = np.degrees(np.arctan2(np.hypot(normal[:, 0], normal[:, 1]), normal[:, 2]))
+    high = max(1.0, float(np.percentile(tilt, 99))) if tilt.size else 1.0
+    colours = (
+        (local[:, 2], "normals, world"),
+        (base[:, 2], "normals of the hull, world"),
+        (normal, "normals, tangent space"),
+        (tangent, "tangents, tangent space"),
+    )
+    maps = tuple(
+        _atlas_panel(
+            pictures.directions_coloured(pictures.texture(v, texel_of_pixel)),
+            texel_of_pixel,
+            label,
+        )
+        for v, label in colours
+    )
+    tilted = pictures.false_colour(pictures.texture(tilt, texel_of_pixel), 0, high, "magma")
+    items = (
+        Figure(
+            maps,
+            "Red, green and blue are X, Y and Z, from -1 (dark) to 1 (bright); +Y is up "
+            "(OpenGL). Recovered normals should show relief that the hull lacks, and run "
+            "smoothly across charts; tangents mean something only where the material is "
+            "anisotropic.",
+            min_width=340,
+        ),
+        Figure(
+            (
+                _atlas_panel(tilted, texel_of_pixel, "angle to the hull's normal"),
+                Panel(plots.histogram({"tilt": tilt}, "angle, degrees", "texels, %"), "tilt"),
+            ),
+            "Where the recovered normal leaves the hull's: hollows, relief, fabric. Speckle "
+            "means that the alignment is not determined there.",
+            colour_bar=ColourBar("magma", 0, high, "degrees"),
+            min_width=280,
+        ),
+    )
+    intro = "Orientations found from the reflectance alone, against those of the hull."
+    return Section("Normals and tangents", intro, items)
+
+
+def _atlas_panel(picture: NDArray[np.uint8], texel_of_pixel: ArrayLike, label: str) -> Panel:
+    """A picture of the atlas, transparent where there is no texel."""
+    shown = pictures.with_alpha(picture, np.asarray(texel_of_pixel) >= 0)
+    return Panel(encode_picture(pictures.fitted(shown, ATLAS_PX), lossless=True), label)
+
+
+def _legend(*entries: tuple[pictures.Colour, str]) -> tuple[tuple[str, str], ...]:
+    return tuple(("#" + "".join(f"{c:02x}" for c in colour), text) for colour, text in entries)

@@ -1,0 +1,291 @@
+"""Sections on pictures: held-out frames and what alignment brings to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reflfield.errors import InputError
+from reflfield.metrics.image_errors import PSNR_CAP_DB
+from reflfield.metrics.image_metrics import (
+    COVERAGE_OF_OBJECT,
+    Comparison,
+    FrameMetrics,
+    FramePair,
+    flip_errors,
+    worst_to_best,
+)
+from reflfield.report import pictures, plots
+from reflfield.report.page import (
+    ColourBar,
+    Figure,
+    Item,
+    Note,
+    Panel,
+    Picture,
+    Section,
+    Table,
+    encode_picture,
+)
+
+ROW_PX = 480
+# FLIP errors of good results lie near 0; full scale would show black pictures.
+FLIP_SCALES = (0.1, 0.2, 0.3, 0.5, 1.0)
+# A distribution of fewer says less than their table.
+FRAMES_FOR_PLOTS = 6
+FLIP_LABEL = "FLIP error, all rows: 0 is not distinguishable"
+METRIC_HEADER = ("PSNR LDR, dB", "PSNR HDR, dB", "SSIM", "FLIP")
+
+
+def frames_section(
+    comparison: Comparison,
+    pairs: Iterable[FramePair],
+    *,
+    title: str = "Held-out frames",
+    intro: str = "Photographs that the field has never seen, beside what it predicts for them.",
+    max_rows: int = 8,
+) -> Section:
+    """Rows photograph | relit | error, and the table of metrics per frame.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of the same frames.
+    pairs : iterable of FramePair
+        In the order of the comparison; read once, one at a time.
+    title, intro : str
+    max_rows : int
+        Rows shown, from the worst frame to the best in even steps.
+
+    Returns
+    -------
+    Section
+
+    Raises
+    ------
+    InputError
+        If the frames are not those of the comparison.
+    """
+    shown = {id(f) for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
+    rows = [
+        compared_row(pair, metrics, comparison.exposure)
+        for pair, metrics in zip(pairs, comparison.frames, strict=True)
+        if id(metrics) in shown
+    ]
+    rows.sort(key=lambda row: (-row.metrics.flip, row.metrics.name))
+    high = flip_scale([row.error for row in rows])
+    items: list[Item] = [_notes_on(comparison)]
+    items += [_row_figure(row, high, has_bar=i == 0) for i, row in enumerate(rows)]
+    if len(comparison.frames) >= FRAMES_FOR_PLOTS:
+        items.append(_distribution(comparison))
+    items.append(metrics_table(comparison))
+    return Section(title, intro, tuple(items))
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedRow:
+    """One frame for the page: pictures, metrics, and FLIP errors, means over some pixels."""
+
+    metrics: FrameMetrics
+    photograph: Picture
+    relit: Picture
+    error: NDArray[np.floating]
+
+
+def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> ComparedRow:
+    """Crop a frame to the object and find where it differs."""
+    if pair.name != metrics.name:
+        raise InputError(
+            f"pairs: expected frame {metrics.name!r} as in the comparison, received "
+            f"{pair.name!r}; pass the frames that were compared, in the same order"
+        )
+    box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
+    photograph, relit = (
+        encode_picture(pictures.fitted(pictures.tonemapped(image[box], exposure), ROW_PX))
+        for image in (np.asarray(pair.photograph), np.asarray(pair.relit))
+    )
+    errors = np.where(pair.counted, flip_errors(pair, exposure), np.float32(np.nan))[box]
+    return ComparedRow(metrics, photograph, relit, pictures.block_means(errors, 2 * ROW_PX))
+
+
+def flip_scale(errors: Sequence[NDArray[np.floating]]) -> float:
+    """End of the colour scale that shows nearly all of the errors."""
+    tops = [float(np.nanpercentile(error, 99)) for error in errors]
+    top = max(tops, default=1.0)
+    return next((scale for scale in FLIP_SCALES if scale >= top), FLIP_SCALES[-1])
+
+
+def error_panel(row: ComparedRow, high: float) -> Picture:
+    """Picture of a row's FLIP error, in false colours from 0 to `high`."""
+    coloured = pictures.false_colour(row.error, 0, high, "magma")
+    error = pictures.fitted(pictures.with_alpha(coloured, np.isfinite(row.error)), ROW_PX)
+    return encode_picture(error, lossless=True)
+
+
+def _row_figure(row: ComparedRow, high: float, *, has_bar: bool) -> Figure:
+    m = row.metrics
+    return Figure(
+        (
+            Panel(row.photograph, "photograph"),
+            Panel(row.relit, "relit"),
+            Panel(error_panel(row, high), f"FLIP error, 0 to {high:g}"),
+        ),
+        f"PSNR {m.psnr_ldr:.2f} dB (HDR {m.psnr_hdr:.2f} dB) · SSIM {m.ssim:.3f} · "
+        f"FLIP {m.flip:.3f} · {m.n_pixels} object pixels"
+        + (f", {m.n_excluded} saturated ones left out" if m.n_excluded else ""),
+        title=m.name,
+        colour_bar=ColourBar("magma", 0.0, high, FLIP_LABEL) if has_bar else None,
+        min_width=0,
+    )
+
+
+def _notes_on(comparison: Comparison) -> Note:
+    ratio = " / ".join("–" if r is None else f"{r:.3f}" for r in comparison.colour_ratio)
+    return Note(
+        f"All pictures at one exposure, {comparison.exposure:.4g}; nothing is rescaled per "
+        "picture. Rows go from the worst frame to the best. Look for missing or smeared "
+        "highlights, shadows with soft or displaced edges, and double contours. Brightness "
+        f"relit / photograph, mean over frames, R / G / B: {ratio} (1 is without bias). "
+        f"{measured_words(comparison)}"
+    )
+
+
+# What a silhouette's origin means to a reader.
+ORIGIN_WORDS = {
+    "given": "given with the photographs",
+    "alpha": "the alpha of the photographs of their cameras",
+    "photographs": "made from all photographs of their cameras",
+    "hull": "the base surface as the cameras see it (too few photographs of those cameras)",
+    "image": "the whole image",
+}
+
+
+def measured_words(comparison: Comparison) -> str:
+    """On what the measures were taken, in a sentence or two."""
+    measured = comparison.measured
+    words = "; ".join(
+        f"{count} {ORIGIN_WORDS.get(origin, origin)}"
+        for origin, count in measured["silhouettes"].items()
+    )
+    text = f"Measured on {measured['pixels']} pixels of the object. Silhouettes: {words}."
+    if n := measured["saturated_pixels_left_out"]:
+        text += f" {n} pixels of the object are saturated in the photographs and left out."
+    if names := measured["frames_not_measured"]:
+        text += f" Not measured, since they show no pixel of the object: {', '.join(names)}."
+    return text
+
+
+def _distribution(comparison: Comparison) -> Figure:
+    ranked = {
+        "PSNR LDR": sorted(f.psnr_ldr for f in comparison.frames),
+        "PSNR HDR": sorted(f.psnr_hdr for f in comparison.frames),
+    }
+    curves = {name: (range(1, len(v) + 1), v) for name, v in ranked.items()}
+    flips = {"FLIP": [f.flip for f in comparison.frames]}
+    return Figure(
+        (
+            Panel(plots.lines(curves, "frames, worst first", "PSNR, dB"), "PSNR, sorted"),
+            Panel(
+                plots.histogram(flips, "FLIP", "frames, %", n_bins=20), "distribution of FLIP"
+            ),
+        ),
+        "A few frames far below the rest usually share a light or a view: see the table.",
+        min_width=300,
+    )
+
+
+def metrics_table(comparison: Comparison) -> Table:
+    """Metrics of every frame, and their mean on top.
+
+    Parameters
+    ----------
+    comparison : Comparison
+
+    Returns
+    -------
+    Table
+    """
+    mean = comparison.mean
+    rows = [("mean", *metric_cells(mean), mean["n_pixels"])]
+    rows += [
+        (f.name, *metric_cells(vars(f)), float(f.n_pixels))
+        for f in worst_to_best(comparison.frames)
+    ]
+    return Table(
+        ("frame", *METRIC_HEADER, "object pixels"),
+        tuple(rows),
+        "Metrics per frame over object pixels, worst FLIP first. PSNR ends at "
+        f"{PSNR_CAP_DB:g} dB (equal pictures).",
+        emphasised=(0,),
+    )
+
+
+def metric_cells(metrics: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """Metrics in the order of `METRIC_HEADER`, as text."""
+    decimals = (("psnr_ldr", 2), ("psnr_hdr", 2), ("ssim", 4), ("flip", 4))
+    red, green, blue, last = (f"{metrics[key]:.{places}f}" for key, places in decimals)
+    return red, green, blue, last
+
+
+def _even_choice(frames: Sequence[FrameMetrics], count: int) -> list[FrameMetrics]:
+    if len(frames) <= count:
+        return list(frames)
+    ranks = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    return [frames[rank] for rank in ranks]
+
+
+def alignment_section(history: ArrayLike, margin: ArrayLike) -> Section:
+    """Alignment: progress of the score, how determined it is.
+
+    Parameters
+    ----------
+    history : (n_iterations,) array_like
+        Accumulated correlation after each iteration.
+    margin : (n_texels,) array_like
+        Score gap to the next distinct peak; near 0 is not determined.
+
+    Returns
+    -------
+    Section
+    """
+    scores = np.asarray(history, dtype=np.float64).ravel()
+    figure = Figure(
+        (
+            Panel(
+                plots.lines(
+                    {"correlation": (np.arange(1, scores.size + 1), scores)},
+                    "iteration",
+                    "accumulated correlation",
+                ),
+                "score by iteration",
+            ),
+            Panel(plots.histogram({"margin": margin}, "margin", "texels, %"), "margin"),
+        ),
+        "The score must never fall, and should level off. Texels at margin 0 have no "
+        "orientation of their own (matte or isotropic materials) and keep the hull's.",
+        min_width=300,
+    )
+    intro = "One local frame per texel, found by correlating apparent BRDFs over all rotations."
+    return Section("Alignment", intro, (figure,))
+
+
+def comparisons_table(comparisons: Mapping[str, Comparison]) -> Table:
+    """Mean metrics of sets of frames.
+
+    Parameters
+    ----------
+    comparisons : mapping of name to Comparison
+
+    Returns
+    -------
+    Table
+    """
+    return Table(
+        ("frames", *METRIC_HEADER),
+        tuple((name, *metric_cells(c.mean)) for name, c in comparisons.items()),
+        "Mean over the frames: higher PSNR and SSIM and lower FLIP are better.",
+    )

@@ -1,0 +1,182 @@
+"""Section on simulated captures: scores against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from reflfield.metrics.completion_error import CompletionError
+from reflfield.metrics.frame_errors import FrameErrors
+from reflfield.metrics.hull_distance import HullDistance
+from reflfield.metrics.image_metrics import (
+    Comparison,
+)
+from reflfield.report import plots
+from reflfield.report.page import (
+    Cell,
+    Figure,
+    Item,
+    Panel,
+    Section,
+    Table,
+)
+from reflfield.report.sections.held_out_images import comparisons_table
+
+
+def truth_section(
+    *,
+    hull: HullDistance | None = None,
+    frames: FrameErrors | None = None,
+    base_frames: FrameErrors | None = None,
+    completion: CompletionError | None = None,
+    comparison: Comparison | None = None,
+) -> Section:
+    """Scores against the truth of a simulated capture; what is not given is left out.
+
+    Parameters
+    ----------
+    hull : HullDistance, optional
+    frames, base_frames : FrameErrors, optional
+        Of the recovered frames, and of the hull's for comparison.
+    completion : CompletionError, optional
+    comparison : Comparison, optional
+        Relit against true pictures.
+
+    Returns
+    -------
+    Section
+    """
+    items: list[Item] = []
+    if hull is not None:
+        items += _hull_items(hull)
+    if frames is not None:
+        items += _frame_items({"recovered": frames} | _if_given("hull", base_frames))
+    if completion is not None:
+        items.append(_completion_table(completion))
+    if comparison is not None:
+        items.append(comparisons_table({"relit against truth": comparison}))
+    intro = "The capture was simulated, so the right answers are known."
+    return Section("Against the truth", intro, tuple(items))
+
+
+def _hull_items(hull: HullDistance) -> list[Item]:
+    millimetres = 1e3 * hull.signed
+    limits = tuple(float(p) for p in np.percentile(millimetres, [0.5, 99.5]))
+    plot = plots.histogram(
+        {"hull": millimetres},
+        "signed distance from the true surface, mm",
+        "area of the hull, %",
+        limits=(limits[0], limits[1]) if limits[1] > limits[0] else None,
+    )
+    figure = Figure(
+        (Panel(plot),),
+        "A visual hull encloses the object, so most of its area should lie outside (right of "
+        "0), far outside where hollows cannot be seen in any silhouette. Area left of 0 was "
+        "carved away wrongly or smoothed off.",
+        title="Hull against the true surface",
+        min_width=300,
+    )
+    return [figure, _hull_table(hull.summary())]
+
+
+def _hull_table(found: Mapping[str, float]) -> Table:
+    statistics = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "largest"}
+    return Table(
+        ("distance", "mm", "voxels"),
+        tuple(
+            (label, found[f"{key}_mm"], found.get(f"{key}_voxels"))
+            for key, label in statistics.items()
+        ),
+        f"Unsigned distance of the hull from the true surface. {found['outside_share']:.1%} of "
+        f"the hull's area lies outside of the object, {found['inside_share']:.1%} inside.",
+    )
+
+
+def _frame_items(variants: Mapping[str, FrameErrors]) -> list[Item]:
+    panels = tuple(
+        Panel(
+            plots.histogram(
+                {name: getattr(errors, kind) for name, errors in variants.items()},
+                f"{kind} error, degrees",
+                "texels, %",
+            ),
+            f"{kind}s",
+        )
+        for kind in ("normal", "tangent")
+    )
+    figure = Figure(
+        panels,
+        "Recovered frames should be closer to the truth than the hull's. Tangents are compared "
+        "as lines (half a turn changes nothing), after one turn about the normal was taken out "
+        "for each target and material, which the reflectance leaves open. Guessed tangents "
+        "are uniform from 0 to 90 degrees: so they are on isotropic materials.",
+        title="Frames against the true shading frames",
+        min_width=300,
+    )
+    return [figure, _frame_table(variants), _turns_table(variants)]
+
+
+def _frame_table(variants: Mapping[str, FrameErrors]) -> Table:
+    labels = sorted({int(label) for errors in variants.values() for label in errors.label})
+    groups = {"all": variants}
+    if len(labels) > 1:
+        groups |= {
+            f"material {label}": {n: e.of_material(label) for n, e in variants.items()}
+            for label in labels
+        }
+    return Table(
+        (
+            "angle",
+            "texels of",
+            "frames",
+            "mean, °",
+            "median, °",
+            "95th percentile, °",
+            "texels",
+        ),
+        tuple(
+            _frame_row(kind, group, name, errors.summary())
+            for kind in ("normal", "tangent")
+            for group, members in groups.items()
+            for name, errors in members.items()
+        ),
+        "Frame errors over the texels that have a true surface point near them. The tangents "
+        "of isotropic materials stand at 45 degrees, a guess.",
+    )
+
+
+def _frame_row(
+    kind: str, group: str, name: str, found: Mapping[str, float]
+) -> tuple[Cell, ...]:
+    angles = (found[f"{kind}_{statistic}_deg"] for statistic in ("mean", "median", "p95"))
+    return kind, group, name, *angles, int(found["n_texels"])
+
+
+def _turns_table(variants: Mapping[str, FrameErrors]) -> Table:
+    return Table(
+        ("frames", "target", "material", "turn removed, °", "texels"),
+        tuple(
+            (name, turn.target, turn.label, f"{turn.degrees:.1f}", turn.n_texels)
+            for name, errors in variants.items()
+            for turn in errors.turns
+        ),
+        "Turns about the normal taken out before tangents are compared: a target and all its "
+        "frames may be turned together without a change to what they explain.",
+    )
+
+
+def _completion_table(error: CompletionError) -> Table:
+    return Table(
+        ("entries", "count", "relative error", "relative error, cube root"),
+        (
+            ("filled in", error.n_unobserved, error.unobserved, error.unobserved_cube_root),
+            ("measured", error.n_observed, error.observed, error.observed_cube_root),
+        ),
+        "Completion against the true apparent BRDFs. Filled-in entries should be nearly as "
+        "close as measured ones; the cube root weighs dark samples more.",
+    )
+
+
+def _if_given(name: str, errors: FrameErrors | None) -> dict[str, FrameErrors]:
+    return {} if errors is None else {name: errors}

@@ -1,0 +1,1 @@
+"""What every package uses: checked input, files written whole, progress, signals."""
