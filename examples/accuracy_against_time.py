@@ -30,11 +30,13 @@ from typing import NamedTuple
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "alignment"))
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "alignment")]
 
 import matplotlib  # noqa: E402
 import numpy as np  # noqa: E402
 import paper_forms  # noqa: E402
+from benchmarks.measuring import Results  # noqa: E402
 from synthetic_btf import (  # noqa: E402
     dome_directions,
     frame_errors,
@@ -53,6 +55,7 @@ from reflfield.sphere.harmonic_projection import Projector  # noqa: E402
 
 RANKS = (2, 4, 6, 8)
 NEWTON_STEPS = 12
+MEASURED = ("reflfield.alignment", "reflfield.sphere.harmonic_projection")
 DEFAULT_LIMIT, DEFAULT_ROUNDS = 8, RefinementOptions().rounds
 MARKERS = {"exact": "o", "grid": "s", "newton": "D", "brute": "^", "refined": "P"}
 NAMES = {
@@ -256,6 +259,25 @@ def write_table(points, path):
         writer.writerows([*one, remark(one)] for one in points)
 
 
+def written(points):
+    """Write the table as results; their path."""
+    results = Results("accuracy_against_time", "What accuracy of the frames costs", MEASURED)
+    results.table("CPU time of one core; mean errors in degrees")
+    for one in points:
+        results.add(
+            {
+                "L": one.band_limit,
+                "method": f"{NAMES[one.kind].partition(',')[0]}: {one.label}",
+                "texels": one.n,
+                "ms per ABRDF": one.milliseconds,
+                "normals": one.normals,
+                "tangents": one.tangents,
+                "": remark(one),
+            }
+        )
+    return results.write()
+
+
 def draw(points, path, title):
     """Normals and tangents over time; lower left is better."""
     matplotlib.use("Agg")
@@ -359,6 +381,7 @@ def main() -> None:
     )
     draw(points, picture, title)
     print(picture)
+    print(written(points))
 
 
 if __name__ == "__main__":

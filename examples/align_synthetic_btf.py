@@ -14,12 +14,16 @@ the recovered frames, so its components tell the error of the frames and nothing
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 import matplotlib
 import numpy as np
+from benchmarks.measuring import Results
 from matplotlib.colors import LogNorm
 from synthetic_btf import (
     ashikhmin_shirley,
@@ -39,6 +43,7 @@ from matplotlib import pyplot
 # Texels whose singular values are computed, as many as in the trial that counted 72.
 MATRIX_TEXELS = 2000
 STAGES = {"harmonic": False, "refined": True}
+MEASURED = ("reflfield.alignment",)
 
 
 class Found(NamedTuple):
@@ -82,7 +87,7 @@ def recovered(samples, directions, truth, n_threads):
     return found
 
 
-def show(condition, found, truth):
+def show(condition, found, truth, results):
     """Rows of the table of times and errors."""
     for stage, (frames, seconds) in found.items():
         normals, tangents = frame_errors(frames, truth)
@@ -92,6 +97,18 @@ def show(condition, found, truth):
             f"{np.median(normals):.3f} | {np.percentile(normals, 95):.3f} | "
             f"{tangents.mean():.3f} | {np.percentile(tangents, 95):.3f} |",
             flush=True,
+        )
+        results.add(
+            {
+                "samples": condition,
+                "stage": stage,
+                "wall time, s": wall,
+                "CPU time, s": cpu,
+                "normals, mean": normals.mean(),
+                "normals, 95 %": np.percentile(normals, 95),
+                "tangents, mean": tangents.mean(),
+                "tangents, 95 %": np.percentile(tangents, 95),
+            }
         )
 
 
@@ -222,7 +239,7 @@ def draw_maps(truth, found, width, path):
     pyplot.close(figure)
 
 
-def draw(truth, found, directions, width, folder):
+def draw(truth, found, directions, width, folder, results):
     """All figures, and the count of components."""
     some = np.unique(np.linspace(0, len(truth) - 1, min(MATRIX_TEXELS, len(truth))).astype(int))
     sampled = matrices(
@@ -231,7 +248,11 @@ def draw(truth, found, directions, width, folder):
         directions,
     )
     values = {name: singular_values(matrix) for name, matrix in sampled.items()}
+    results.table("Unaligned components that leave as little energy as two aligned ones")
     for stage in STAGES:
+        equal = equal_components(values, stage)
+        left = residual(values[stage])[1]
+        results.add({"stage": stage, "energy left by two": left, "unaligned ones": equal})
         print(
             f"{stage}: two aligned components leave {residual(values[stage])[1]:.2e} of the "
             f"energy, as {equal_components(values, stage)} unaligned ones"
@@ -253,6 +274,8 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("synthetic_btf"))
     options = parser.parse_args()
     truth, directions = relief_frames(*options.size), dome_directions()
+    results = Results("align_synthetic_btf", "The paper's synthetic scene", MEASURED)
+    results.table(f"{len(truth)} texels, errors in degrees")
     samples = sample_texels(truth, directions, directions)
     # Compile the kernels before the clock starts.
     align(samples[:2], directions, directions)
@@ -262,15 +285,16 @@ def main() -> None:
         "|---|---|---|---|---|---|---|---|---|"
     )
     clean = recovered(samples, directions, truth, options.threads)
-    show("clean", clean, truth)
+    show("clean", clean, truth, results)
     for name, noise, unobserved in (
         (f"noise {options.noise:.0%}", options.noise, 0.0),
         (f"{options.unobserved:.0%} unobserved", 0.0, options.unobserved),
     ):
         if noise or unobserved:
             worse = degraded(samples, noise, unobserved)
-            show(name, recovered(worse, directions, truth, options.threads), truth)
-    draw(truth, clean, directions, options.size[0], options.output)
+            show(name, recovered(worse, directions, truth, options.threads), truth, results)
+    draw(truth, clean, directions, options.size[0], options.output, results)
+    print(results.write())
 
 
 if __name__ == "__main__":

@@ -14,6 +14,11 @@ import argparse
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from benchmarks.measuring import Results
 
 from capture_sim.brightness import measured
 from capture_sim.contributions import contributions, some_pairs
@@ -83,10 +88,14 @@ def main() -> None:
         mistakes += [f"{name}: {effect}" for effect in wrong]
     print("| effect | " + " | ".join(f"`{name}`" for name in PRESETS) + " |")
     print("|---" * (len(PRESETS) + 1) + "|")
+    results = Results("effects_of_presets", "What each effect changes", ["capture_sim.write"])
+    results.table(f"Percent of the 99th percentile; {arguments.side} pixels; (ms); bold: on")
     for effect in EFFECTS:
         cells = [columns[name].get(effect.NAME, "-") for name in PRESETS]
+        results.add({"effect": effect.NAME} | dict(zip(PRESETS, cells, strict=True)))
         print(f"| `{effect.NAME}` | " + " | ".join(cells) + " |")
     print("wrong: " + (", ".join(mistakes) or "none"))
+    print(results.write())
     sys.exit(bool(mistakes))
 
 

@@ -17,14 +17,18 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import matplotlib
 
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+from benchmarks.measuring import Results
 
 from capture_sim.effects import (
     dropped_photographs,
@@ -120,6 +124,19 @@ def table(results: dict[str, dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def written(scene: str, scores: dict[str, dict]) -> Path:
+    """Write the table as results; their path."""
+    results = Results(
+        "effects_on_the_pipeline",
+        "What each effect does to the field",
+        ["reflfield.pipeline.stages", "capture_sim.write"],
+    )
+    results.table(f"Scene {scene}, a coarse field, unseen views and lights")
+    for name, score in scores.items():
+        results.add({"effect": name} | {COLUMNS[key]: score[key] for key in COLUMNS})
+    return results.write()
+
+
 def plot(results: dict[str, dict], path: Path) -> None:
     """Bars of every measure; line: the capture without errors; band: those like it."""
     names = [name for name in results if name not in (NOTHING, *HARMLESS)]
@@ -165,6 +182,7 @@ def main() -> None:
     (arguments.out / "effects.md").write_text(table(results))
     plot(results, arguments.out / "effects.png")
     print(table(results))
+    print(written(arguments.scene, results))
     print(arguments.out / "effects.png")
 
 

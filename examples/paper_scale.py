@@ -33,7 +33,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 import distributed
+from benchmarks.measuring import Results
 
 SCENE = """
 effects = ["antialiasing", "near_lights", "shadows"]
@@ -75,6 +78,7 @@ BY_TEXELS = {
     ),
 }
 
+MEASURED = ("reflfield.pipeline.stages",)
 # Stages in which a worker is killed: those that read or write the samples by blocks.
 LOSING = ("observations", "completion", "alignment", "resampling", "compression")
 
@@ -137,14 +141,33 @@ def processed(arguments: argparse.Namespace, capture: Path) -> None:
     out = arguments.out / "run"
     call(*process_words(arguments, capture, out, arguments.texels, 2048))
     timings = json.loads((out / "timings.json").read_text())
+    results = Results("paper_scale", "The paper's job", MEASURED)
+    size = f"{arguments.pixels} pixels, {arguments.texels} texels a side"
+    results.table(f"{arguments.rig}, {size}")
     for stage in timings["stages"]:
         say(stage["name"], stage["seconds"], stage["cpu_seconds"], stage["peak_bytes"])
+        results.add(stage_cells(stage["name"], stage))
     cpu = sum(stage["cpu_seconds"] for stage in timings["stages"])
     say("after simulation", timings["seconds"], cpu, timings["peak_bytes"])
+    results.add(stage_cells("together", {**timings, "cpu_seconds": cpu}))
     print(f"ceiling of memory {timings['max_memory'] / 2**30:.2f} GB")
     metrics = json.loads((out / "metrics.json").read_text())
     print(f"held out: PSNR {metrics['mean']['psnr_ldr']:.2f} dB")
     print(f"field: {(out / 'field.rfld').stat().st_size / 1e6:.2f} MB")
+    results.table("Held-out photographs, 2 views x 2 lights")
+    size = (out / "field.rfld").stat().st_size / 1e6
+    results.add({"LDR PSNR, dB": metrics["mean"]["psnr_ldr"], "field, MB": size})
+    print(results.write())
+
+
+def stage_cells(name: str, record: dict[str, Any]) -> dict[str, Any]:
+    """Row of the results for one stage."""
+    return {
+        "stage": name,
+        "wall time, s": record["seconds"],
+        "CPU time, s": record["cpu_seconds"],
+        "peak memory, GB": record["peak_bytes"] / 2**30,
+    }
 
 
 def digests(out: Path) -> dict[str, str]:
@@ -344,6 +367,8 @@ def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
     """Print the processor time of one texel at several sizes of the texture."""
     print("texture       texels   ms of the processor per texel: " + ", ".join(BY_TEXELS))
     totals = []
+    results = Results("paper_scale_per_texel", "What one texel costs", MEASURED)
+    results.table(f"{arguments.rig}, CPU time of a texel, ms")
     for side in arguments.per_texel:
         out = arguments.out / f"texels_{side}"
         words = process_words(arguments, capture, out, side, arguments.training)
@@ -366,8 +391,11 @@ def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
         totals.append(sum(parts))
         shown = "".join(f"{part:9.2f}" for part in (*parts, totals[-1]))
         print(f"{side:4d} x {side:4d} {seen:9d} {shown}", flush=True)
+        cells = dict(zip((*BY_TEXELS, "together"), (*parts, totals[-1]), strict=True))
+        results.add({"texture": f"{side} x {side}", "texels": seen} | cells)
     mean = sum(totals) / len(totals)
     print(f"largest deviation from the mean: {max(abs(t / mean - 1) for t in totals):.1%}")
+    print(results.write())
 
 
 def main() -> None:

@@ -31,7 +31,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / "examples")]
 
 import numpy as np  # noqa: E402
-from benchmarks.measuring import on_cores  # noqa: E402
+from benchmarks.measuring import Results, on_cores  # noqa: E402
 from benchmarks.peers import missing  # noqa: E402
 from synthetic_btf import (  # noqa: E402
     RINGS_151,
@@ -58,6 +58,18 @@ SEARCH = "exact, searched, to the peak"
 PROJECTION, COUPLING = "projection, 151 x 151 samples", "coupling"
 PEERS = ("s2fft", "pysofft")
 TARGET_LIMIT = 8
+MODULES = ("reflfield.alignment", "reflfield.sphere.harmonic_projection")
+TABLES = {
+    1: "One correlation of two functions of direction on a grid",
+    2: "One ABRDF against the target; angles in degrees",
+    0: "Before the search",
+}
+# Keys of a measurement, and the columns that they become.
+COLUMNS = {
+    "band_limit": "L", "cores": "cores", "method": "method", "ms": "ms", "cpu_ms": "CPU, ms",
+    "megabytes": "MB", "rotations": "rotations", "error": "error", "median": "to the maximum",
+    "tail": "99 %", "at_peak": "share at most .05", "planted": "to the frame",
+}  # fmt: skip
 
 
 # --- the problem --------------------------------------------------------------------------
@@ -237,8 +249,21 @@ def target(text, value, least):
     return value >= least
 
 
+def written(rows):
+    """Write all tables to the file of results; its path."""
+    results = Results("alignment", "Search over SO(3)", MODULES)
+    for number, title in TABLES.items():
+        results.table(title)
+        for row in rows:
+            if row["table"] == number:
+                results.add({name: row[key] for key, name in COLUMNS.items() if key in row})
+    return results.write()
+
+
 def show_memory(path, n, cores):
     print("\nPeak memory of a whole harmonic alignment, 151 x 151 samples, read in blocks")
+    results = Results("alignment_memory", "Memory of a harmonic alignment", MODULES)
+    results.table("")
     for count in (n, 4 * n, 16 * n):
         (row,) = on_cores(cores, METHODS, "memory", path, cores, count)
         print(
@@ -246,6 +271,8 @@ def show_memory(path, n, cores):
             f"{row['megabytes']:>8.0f} MB",
             flush=True,
         )
+        results.row(ABRDFs=count, s=row["ms"] * count / 1e3, MB=row["megabytes"])
+    print(results.write())
 
 
 def main() -> None:
@@ -276,6 +303,7 @@ def main() -> None:
     show("Before the search, and the search beside it", tables[0] + searches, "", lambda _: "")
     show_ratios(tables[2])
     check(rows)
+    print(written(rows))
     raise SystemExit(0 if targets(rows) else 1)
 
 

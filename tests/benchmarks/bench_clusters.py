@@ -18,9 +18,10 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parents[1] / "examples"))
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / "examples")]
 
 import numpy as np  # noqa: E402
+from benchmarks.measuring import Results  # noqa: E402
 from scipy.optimize import linear_sum_assignment  # noqa: E402
 from synthetic_btf import (  # noqa: E402
     dome_directions,
@@ -71,7 +72,7 @@ def mixture(materials, n, noise, rng):
     return samples, directions, frames, label
 
 
-def compare(name, materials, options):
+def compare(name, materials, options, results):
     """One line: labels and normals together, and normals of each material alone."""
     rng = np.random.default_rng(3)
     samples, d, frames, label = mixture(materials, options.texels, options.noise, rng)
@@ -90,6 +91,16 @@ def compare(name, materials, options):
         f"{np.percentile(together, 95):.3f} (alone {np.percentile(alone, 95):.3f})   "
         f"{wall:.0f} s ({cpu:.0f} s of processors)",
         flush=True,
+    )
+    results.add(
+        {
+            "materials": name,
+            "labels right, %": 100 * agreement(found.cluster, label),
+            "normals, mean degrees": together.mean(),
+            "each alone": alone.mean(),
+            "wall time, s": wall,
+            "CPU time, s": cpu,
+        }
     )
 
 
@@ -116,7 +127,7 @@ class Made:
         return out
 
 
-def large(n, options):
+def large(n, options, results):
     """Time and memory of 16 clusters on many texels, by harmonics."""
     source = Made(n)
     d = source.directions
@@ -132,6 +143,14 @@ def large(n, options):
             f"({cpu:.0f} s of processors) beside making the samples; peak {peak:.2f} GB",
             flush=True,
         )
+        results.add(
+            {
+                "materials": f"16, {n} texels, {'refined' if refine else 'harmonic'}",
+                "wall time, s": wall,
+                "CPU time, s": cpu,
+                "peak memory, GB": peak,
+            }
+        )
 
 
 def main() -> None:
@@ -143,12 +162,15 @@ def main() -> None:
     parser.add_argument("--refined", action="store_true", help="the large case refined too")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
+    results = Results("clusters", "Materials told apart", ["reflfield.alignment"])
+    results.table(f"{options.texels} texels of each mixture, noise {options.noise:g}")
     warm = mixture(SETS["two similar"], 8, 0.0, np.random.default_rng(0))
     align(warm[0], warm[1], warm[1], n_clusters=2)  # compile before the clock starts
     for name, materials in SETS.items() if options.texels else ():
-        compare(name, materials, options)
+        compare(name, materials, options, results)
     if options.large:
-        large(options.large, options)
+        large(options.large, options, results)
+    print(results.write())
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ if __name__ == "__main__":  # tests that import this must not hand it on to what
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from benchmarks.measuring import Results
 from factorization.problems import hemisphere, problem, unobserved_error
 from sklearn.decomposition import IncrementalPCA
 from sklearn.utils.extmath import randomized_svd
@@ -35,6 +36,7 @@ RANK = 12
 # twice as many columns (all but a few rows near the horizon).
 DETERMINED = 2 * RANK
 missed: list[str] = []
+results = Results("factorization", "Factorization", ["reflfield.factorization"])
 
 
 def measured(function):
@@ -49,9 +51,17 @@ def measured(function):
     return result, seconds, peak
 
 
+def heading(text):
+    print(f"\n{text}")
+    results.table(text)
+
+
 def row(label, error, seconds, megabytes, note=""):
     print(
         f"  {label:<44}{error:>10.5f}{seconds:>9.2f} s{megabytes:>8.0f} MB  {note}", flush=True
+    )
+    results.add(
+        {"method": label, "error": error, "CPU, s": seconds, "MB": megabytes, "note": note}
     )
 
 
@@ -116,7 +126,7 @@ def completion(pattern, sizes, limits):
     share = data.observed.mean()
     few = int((data.observed.sum(axis=1) < DETERMINED).sum())
     shape = " x ".join(map(str, data.truth.shape))
-    print(f"\ncompletion, {pattern}, {shape}, {share:.0%} observed, without {few} rows")
+    heading(f"completion, {pattern}, {shape}, {share:.0%} observed, without {few} rows")
 
     def ours(passes):
         return lambda: complete(data.measured, data.observed, rank=RANK, passes=passes)
@@ -183,7 +193,7 @@ def online(n_rows, n_columns):
     rng = np.random.default_rng(1)
     exact = rng.standard_normal((n_rows, RANK)) @ rng.standard_normal((RANK, n_columns))
     noisy = exact + 0.01 * rng.standard_normal(exact.shape)
-    print(f"\nonline SVD, {n_rows} x {n_columns}, largest entry of U^T U - I in brackets")
+    heading(f"online SVD, {n_rows} x {n_columns}, largest entry of U^T U - I in brackets")
     for case, rank, wide in [("1 % noise", RANK, noisy), ("deficient", 2 * RANK, exact)]:
         for dtype, limit in [("float32", 1e-5), ("float64", 1e-12)]:
             matrix = wide.astype(dtype)
@@ -242,7 +252,7 @@ def local(n_columns, n_side, aligned):
     n_vq = size // n_rows
     kind = "aligned" if aligned else "unaligned"
     shape = f"{n_columns} columns x {n_rows} rows"
-    print(f"\nlocal PCA, {shape}, {kind}, {size / 1e6:.2f} M numbers each")
+    heading(f"local PCA, {shape}, {kind}, {size / 1e6:.2f} M numbers each")
     errors = {}
     for label, options in [
         ("local PCA 16 x 10", LocalPCA(16, 10)),
@@ -286,6 +296,8 @@ def main():
     for pattern in ("random", "hemispheric", "smooth"):
         if chosen.only in (None, pattern):
             completion(pattern, sizes, limits)
+    if chosen.only is None:
+        print(results.write())
     if missed:
         print("\nmissed: " + "; ".join(missed))
     return int(bool(missed))

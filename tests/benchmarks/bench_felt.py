@@ -20,10 +20,14 @@ import argparse
 import itertools
 import os
 import resource
+import sys
 import time
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import numpy as np
+from benchmarks.measuring import Results
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -117,8 +121,9 @@ def mean_normal_error(truth):
     return np.rad2deg(np.arctan2(np.hypot(mean[0], mean[1]), mean[2]))
 
 
-def report(name, seconds, result, truth):
+def report(name, seconds, result, truth, results):
     """One stage: errors, and the errors by margin."""
+    results.table(f"Frames after the {name} stage, degrees")
     for label, frames in (
         ("as found", result.local_from_base),
         ("less the common turn", without_common_turn(result.local_from_base, truth)),
@@ -130,6 +135,7 @@ def report(name, seconds, result, truth):
             f"{np.percentile(normal, 95):.2f}   turn median {np.median(turn):.2f} 95 % "
             f"{np.percentile(turn, 95):.2f}"
         )
+        results.add({"frames": label, "wall time, s": seconds} | columns(normal, turn))
     print(f"          symmetry {result.symmetries[0]}; errors by margin:")
     print("          margin              texels  normal median   95 %   turn median   95 %")
     edges = np.quantile(result.margin, [0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0])
@@ -140,6 +146,20 @@ def report(name, seconds, result, truth):
             f" {np.percentile(normal[mine], 95):8.2f} {np.median(turn[mine]):11.2f}"
             f" {np.percentile(turn[mine], 95):8.2f}"
         )
+        results.add(
+            {"frames": f"margin {low:.5f} to {high:.5f}", "texels": int(mine.sum())}
+            | columns(normal[mine], turn[mine])
+        )
+
+
+def columns(normal, turn):
+    """Cells of some texels' errors."""
+    return {
+        "normal, median": np.median(normal),
+        "95 %": np.percentile(normal, 95),
+        "turn, median": np.median(turn),
+        "turn, 95 %": np.percentile(turn, 95),
+    }
 
 
 def main() -> None:
@@ -155,6 +175,7 @@ def main() -> None:
     if not root.exists():
         raise SystemExit(f"{root} not found: set REFLFIELD_DATA to the folder of the test data")
     directions, reflectance = measured(root)
+    results = Results("felt", "Known rotations of a measured felt", ["reflfield.alignment"])
     print(
         f"spline at a direction left out: {100 * leave_one_out(directions, reflectance):.1f} %"
     )
@@ -176,9 +197,12 @@ def main() -> None:
         result = align(
             samples, directions, directions, refine=refine, n_threads=options.threads
         )
-        report(name, time.perf_counter() - start, result, truth)
+        report(name, time.perf_counter() - start, result, truth, results)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory {peak:.2f} GB, of which samples {samples.nbytes / 2**30:.2f} GB")
+    results.table("Memory")
+    results.add({"peak memory, GB": peak, "of which samples": samples.nbytes / 2**30})
+    print(results.write())
 
 
 if __name__ == "__main__":

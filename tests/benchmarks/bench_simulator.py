@@ -14,12 +14,16 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import numpy as np
+from benchmarks.measuring import Results
 
 from capture_sim.effects.registry import decided
 from capture_sim.files import write_exr
@@ -41,6 +45,7 @@ from capture_sim.write import write_capture
 
 DIRECT = EffectOptions(simulate=("antialiasing", "near_lights", "shadows"))
 N_PLAIN_LIGHTS = 4
+MEASURED = ("capture_sim.write",)
 
 
 def dome(rig, thing, material, side):
@@ -120,13 +125,14 @@ def measured(scene, n_views, folder):
     return trace, totals * len(scene.cameras) / n_views, np.mean(errors, axis=0), n_points
 
 
-def report(scene, n_views):
+def report(scene, n_views, results):
     with tempfile.TemporaryDirectory() as folder:
         trace, totals, errors, n_points = measured(scene, n_views, Path(folder))
     sampling, shading, writing, every_ray, slow = totals
     whole = trace + sampling + shading + writing
     n_photographs = len(scene.cameras) * len(scene.lights)
     print(f"{n_photographs} photographs, {n_points / n_views:.0f} points a view")
+    results.table(f"{n_photographs} photographs, CPU time of one thread")
     for name, value in (
         ("visibility of the lights, once", trace),
         ("rays of the pixels, once a view", sampling),
@@ -136,6 +142,7 @@ def report(scene, n_views):
     ):
         share = f"{100 * value / whole:4.0f} %"
         print(f"  {name:34}{value:8.1f} s {share} {1e3 * value / n_photographs:8.2f} ms each")
+        results.add({"stage": name, "s": value, "ms each": 1e3 * value / n_photographs})
     print(f"  {'shading, a ray for every pair':34}{every_ray:8.1f} s")
     print(f"  {'shading, plain sums over pairs':34}{slow:8.1f} s, {slow / shading:.1f} times")
     print(
@@ -143,11 +150,16 @@ def report(scene, n_views):
         f"lit pixels changed {errors[1]:.1e}"
     )
     print(f"  error against plain sums: relative L2 {errors[2]:.1e}")
+    results.add({"stage": "shading, a ray for every pair", "s": every_ray})
+    results.add({"stage": "shading, plain sums over pairs", "s": slow})
+    results.add({"stage": "relative L2 against a ray for every pair", "error": errors[0]})
+    results.add({"stage": "share of lit pixels changed", "error": errors[1]})
+    results.add({"stage": "relative L2 against plain sums", "error": errors[2]})
     assert errors[2] < 1e-5, "the compiled BRDFs have lost digits"
     assert errors[1] < 1e-3, "visibility at nodes is no longer next to exact"
 
 
-def off_is_free(n_runs):
+def off_is_free(n_runs, results):
     """Time with every effect described and off, over that of shading and nothing else."""
     scene = load_scene("vase")
     nothing = replace(scene.effects, simulate="none")
@@ -166,11 +178,13 @@ def off_is_free(n_runs):
     assert np.array_equal(described(), shaded()), "an effect that is off left a trace"
     times = np.array([[seconds(described)[0], seconds(shaded)[0]] for _ in range(n_runs)])
     ratio = np.divide(*np.median(times, axis=0))
+    results.table("Every effect described and off, over bare shading")
+    results.add({"runs": n_runs, "time over that of bare shading": ratio})
     print(f"every effect described and off: {ratio:.2f} times the time of bare shading, "
           f"medians of {n_runs} alternating runs; photographs equal bit by bit")  # fmt: skip
 
 
-def write_whole(scene, workers, max_memory):
+def write_whole(scene, workers, max_memory, results):
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
         start, spent = time.perf_counter(), time.process_time()
         write_capture(scene, Path(folder) / "capture", workers=workers, max_memory=max_memory)
@@ -179,6 +193,8 @@ def write_whole(scene, workers, max_memory):
         size = sum(file.stat().st_size for file in files)
     n = len(scene.cameras) * len(scene.lights)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    results.table(f"The whole capture, {workers} workers")
+    results.row(photographs=n, wall_s=wall, CPU_s=spent, GB=size / 1e9, peak_memory_GB=peak)
     print(f"whole capture, {workers} workers: {n} photographs in {wall:.0f} s, {spent:.0f} s "
           f"of the processor, {size / 1e9:.2f} GB, peak memory {peak:.2f} GB of "
           f"{max_memory / 2**30:.2f} allowed")  # fmt: skip
@@ -197,12 +213,17 @@ def main():
     parser.add_argument("--off", type=int, metavar="RUNS", help="only: what is off is free")
     options = parser.parse_args()
     if options.off:
-        off_is_free(options.off)
+        results = Results("simulator_off", "Simulator: what is off is free", MEASURED)
+        off_is_free(options.off, results)
+        print(results.write())
         return
+    title = f"Simulator: {options.object} in {options.rig}, {options.side} pixels"
+    results = Results(f"simulator_{options.rig}", title, MEASURED)
     scene = dome(options.rig, options.object, options.material, options.side)
-    report(scene, options.views)
+    report(scene, options.views, results)
     if options.whole:
-        write_whole(scene, options.workers, parse_bytes(options.max_memory))
+        write_whole(scene, options.workers, parse_bytes(options.max_memory), results)
+    print(results.write())
 
 
 if __name__ == "__main__":

@@ -1,17 +1,29 @@
-"""Time and peak memory of a piece of work, on a stated number of cores."""
+"""Time and peak memory of a piece of work; figures in files, with what they were measured on.
+
+Benchmarks, and examples that measure, fill a `Results` and write it: ``results/NAME.json``.
+``make_results.py`` makes the pages from these files.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import os
+import platform
+import re
+import shlex
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
 import psutil
+
+from reflfield.util.files import replacing
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -112,3 +124,125 @@ def on_cores(n_cores, script, *arguments):
         tail = "\n".join(done.stderr.strip().splitlines()[-5:])
         raise RuntimeError(f"{script} {' '.join(map(str, arguments))}: {tail}")
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+
+
+# --- results --------------------------------------------------------------------------------
+
+RESULTS = ROOT / "tests" / "benchmarks" / "results"
+# Another folder for what a test or a trial measures.
+ELSEWHERE = "REFLFIELD_RESULTS"
+# What every file of results holds.
+KEYS = ("name", "title", "command", "date", "commit", "machine", "versions", "code", "tables")
+
+
+class Results:
+    """Figures of one benchmark, row by row, and what they were measured on.
+
+    Parameters
+    ----------
+    name : str
+        Of the file, without suffix.
+    title : str
+        One line, the heading in ``RESULTS.md``.
+    modules : iterable of str
+        Modules whose code, with all that they import, the figures depend on.
+    """
+
+    def __init__(self, name, title, modules):
+        self.name, self.title, self.modules = name, title, tuple(modules)
+        self.tables = []
+
+    def table(self, title):
+        """Begin a table; the rows that follow belong to it."""
+        self.tables.append({"title": title, "rows": []})
+
+    def row(self, **cells):
+        """One row; text, numbers, or None where nothing was measured."""
+        self.add(cells)
+
+    def add(self, cells):
+        """One row, as a mapping from column to value."""
+        self.tables[-1]["rows"].append({name: plain(value) for name, value in cells.items()})
+
+    def write(self):
+        """Write NAME.json, and return its path."""
+        folder = Path(os.environ.get(ELSEWHERE, RESULTS))
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.name}.json"
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+        return path
+
+    def to_dict(self):
+        """The file's content, by `KEYS`."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "command": command(),
+            "date": datetime.now(UTC).date().isoformat(),
+            "commit": commit(),
+            "machine": machine(),
+            "versions": versions(),
+            "code": digests(self.modules),
+            "tables": self.tables,
+        }
+
+
+def plain(value):
+    """A cell as JSON has it: numpy's numbers as Python's, what is not finite as text."""
+    value = value.item() if hasattr(value, "item") else value
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if value is None or isinstance(value, (str, int, float)):
+        return value
+    raise TypeError(f"cell: expected text, a number or None, received {type(value).__name__}")
+
+
+def command():
+    """This process's command line, as one would type it in the root of the repository."""
+    script = Path(sys.argv[0]).resolve()
+    inside = script.relative_to(ROOT) if script.is_relative_to(ROOT) else script
+    return shlex.join(["python", str(inside), *sys.argv[1:]])
+
+
+def commit():
+    """Commit of the working tree, with a + where files differ from it; empty without git."""
+    git = ["git", "-C", str(ROOT)]
+    head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True,
+                          text=True, check=False)  # fmt: skip
+    changed = subprocess.run([*git, "status", "--porcelain", "reflfield", "capture_sim"],
+                             capture_output=True, text=True, check=False)  # fmt: skip
+    return head.stdout.strip() + "+" * bool(changed.stdout.strip())
+
+
+def machine():
+    """Processor, cores that this process may use, memory."""
+    names = re.findall(r"^model name\s*:\s*(.+)$", read_if_there("/proc/cpuinfo"), re.MULTILINE)
+    return {
+        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
+    }
+
+
+def read_if_there(path):
+    """Text of a file; empty where the system has none."""
+    return Path(path).read_text() if Path(path).is_file() else ""
+
+
+def versions():
+    """Versions of this package and of what it computes with."""
+    # The pipeline's packages import much that what is measured here does not need.
+    from reflfield.pipeline.cache import versions as installed
+
+    return installed()
+
+
+def digests(modules):
+    """Digest of each module's code with all that it imports."""
+    from reflfield.pipeline.code_digests import code_digest
+
+    for name in modules:
+        if find_spec(name) is None:
+            raise ValueError(f"modules: expected modules that exist, received {name!r}")
+    return {name: code_digest(name) for name in modules}

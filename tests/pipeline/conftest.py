@@ -1,6 +1,7 @@
 """A tiny simulated capture, a finished run of it, and the command in this process."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -109,8 +110,12 @@ def tiny_options(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def subprocess_run():
-    """Function that runs a Python command line in a process of its own."""
+def subprocess_run(tmp_path_factory):
+    """Function that runs a Python command line in a process of its own.
+
+    What an example measures is not kept beside the results of the benchmarks.
+    """
+    results = str(tmp_path_factory.mktemp("results"))
 
     def run(*words, timeout=250):
         done = subprocess.run(
@@ -119,6 +124,7 @@ def subprocess_run():
             text=True,
             check=False,
             timeout=timeout,
+            env={**os.environ, "REFLFIELD_RESULTS": results},
         )
         return Outcome(done.returncode, done.stdout, done.stderr)
 
