@@ -12,7 +12,7 @@ from reflfield.pipeline import code_digests
 from reflfield.pipeline.code_digests import code_digest, modules_of
 from tests.test_layers import imports_of
 
-ROOT = Path(code_digests.__file__).parent
+ROOT = Path(code_digests.__file__).parents[1]
 FILES = {
     "__init__": '"""Nothing."""\n',
     "stage": "from toy.parts import one\nimport os\n\n\ndef run():\n"
