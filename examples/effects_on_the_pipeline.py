@@ -44,7 +44,7 @@ from reflfield.capture.readers import open_capture
 from reflfield.field.file import open_field
 from reflfield.metrics.truth_files import open_truth
 from reflfield.options import Resources, read_toml, with_tables
-from reflfield.pipeline import comparison
+from reflfield.pipeline import comparison, truth_comparison
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import run
 
@@ -89,10 +89,11 @@ def score(capture: Path, out: Path, options: PipelineOptions, workers: int) -> d
     job = run(open_capture(capture), out, options, resources=resources, last="comparison")
     truth = open_truth(capture)
     field = open_field(job.stages.root / "compression" / "field.rfld")
-    frames, _ = comparison.frame_scores(job, truth, field)
+    compared = comparison.comparison_of(job, "truth")
+    frames, _ = truth_comparison.frame_scores(job, truth, field)
     return {
-        "psnr": comparison.stored_comparison(job, "truth")["mean"]["psnr_ldr"],
-        "hull_mm": comparison.hull_score(job, truth).summary()["mean_mm"],
+        "psnr": compared.mean["psnr_ldr"],
+        "hull_mm": truth_comparison.hull_score(job, truth).summary()["mean_mm"],
         "normal_deg": frames.summary()["normal_median_deg"],
         "tangent_deg": frames.summary()["tangent_median_deg"],
     }

@@ -298,7 +298,7 @@ def relight_to(
     """Relight frames; their EXR files."""
     from reflfield.capture.readers import open_capture
     from reflfield.pipeline.memory import check_frames_memory
-    from reflfield.pipeline.standalone import write_relit_frames
+    from reflfield.pipeline.relight_command import write_relit_frames
 
     opened = open_capture(frames, require_photographs=False, **reading)
     return write_relit_frames(field, opened, out, check_frames_memory(field, opened, *limits))
@@ -320,8 +320,8 @@ def compare(
     """Relight frames and measure them against their photographs."""
     from reflfield.capture.readers import open_capture
     from reflfield.field.file import open_field
+    from reflfield.pipeline.compare_command import write_standalone_comparison
     from reflfield.pipeline.memory import check_frames_memory
-    from reflfield.pipeline.standalone import write_standalone_comparison
 
     limits = picture_limits(samples, workers, max_memory)
     opened = open_field(field, max_bytes=limits[1].max_memory)
@@ -416,9 +416,9 @@ def say_results(job: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     from reflfield.pipeline.hold_out import held_out_words, left_out_words
     from reflfield.pipeline.model_selection import words_of
-    from reflfield.pipeline.outputs import problems_of
     from reflfield.pipeline.publishing import published
-    from reflfield.pipeline.quantising import missed_quality
+    from reflfield.pipeline.quantisation_search import missed_quality
+    from reflfield.pipeline.report import problems_of
 
     for record in job.stages.records:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"

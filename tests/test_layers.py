@@ -92,6 +92,11 @@ def test_every_package_has_its_place():
     assert present == set(PACKAGES)
 
 
+def test_a_module_name_occurs_once():
+    names = [path.stem for path in modules("reflfield") if path.stem != "__init__"]
+    assert sorted(names) == sorted(set(names))
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_packages_import_only_earlier_packages(package):
     found = {

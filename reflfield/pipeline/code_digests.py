@@ -35,7 +35,7 @@ def code_digest(module: str) -> str:
     Parameters
     ----------
     module : str
-        Such as ``reflfield.pipeline.surface``.
+        Such as ``reflfield.pipeline.hull``.
 
     Returns
     -------

@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from reflfield.field.indirect_light import fit_indirect
 from reflfield.observations.texel_reading import Shade, TexelReader
+from reflfield.pipeline.atlas import pixel_width
 from reflfield.pipeline.context import Job
-from reflfield.pipeline.surface import pixel_width
 
 # Texels so near to one that the light reaches, in texel spacings and not less than a pixel, are
 # at the edge of a shadow: their pixels mix both.

@@ -1,4 +1,4 @@
-"""Stage that shows what bits bring: the fitted models quantised more and more coarsely."""
+"""Stage "rate_distortion": the fitted models quantised more and more coarsely."""
 
 from __future__ import annotations
 
@@ -8,23 +8,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.file import PackedSizes
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.held_out_photographs import compare_with_photographs
 from reflfield.metrics.image_metrics import NothingToMeasure
-from reflfield.pipeline.comparison import (
-    MAIN,
-    frame_sets,
-    silhouettes_of_frames,
-    variants,
-)
+from reflfield.pipeline.compared_photographs import frame_sets
+from reflfield.pipeline.comparison import MAIN, variants
+from reflfield.pipeline.compression import stored_model
 from reflfield.pipeline.context import Job
+from reflfield.pipeline.held_out_silhouettes import silhouettes_of_frames
 from reflfield.pipeline.memory import within_memory
-from reflfield.pipeline.quantising import FieldMaker
+from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.report.sections import RatePoint
 from reflfield.util.progress import track
 
@@ -54,14 +48,6 @@ def stored_points(job: Job) -> list[RatePoint]:
     """What the stage has written."""
     stored = json.loads((job.stages.root / "rate_distortion" / POINTS).read_text())
     return [RatePoint(**point) for point in stored]
-
-
-def stored_model(job: Job, stage: str) -> tuple[ClusteredModel, NDArray[np.float32]]:
-    """Model of a compression stage before it was quantised, and its frames."""
-    arrays: dict[str, Any] = job.result(stage, "model.npz")
-    frames = arrays.pop("local_from_world")
-    residuals = tuple(arrays.pop("residuals").tolist())
-    return ClusteredModel(**arrays, residuals=residuals), frames
 
 
 def unfactored_bytes(field: ReflectanceField, sizes: PackedSizes) -> int:

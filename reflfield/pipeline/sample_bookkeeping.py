@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from reflfield.pipeline import comparison
+from reflfield.pipeline.compared_photographs import frame_sets
 from reflfield.pipeline.context import Job
 from reflfield.report.sections import Account
 
@@ -136,7 +137,7 @@ def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
 def _frames(job: Job) -> Account:
     """Frames that are compared, from the metrics that were written."""
     names = {"heldout": "held out", "truth": "unseen and simulated"}
-    sets, parts = comparison.frame_sets(job), {}
+    sets, parts = frame_sets(job), {}
     for name, frames in sets.items():
         measured = comparison.comparison_of(job, name)
         if measured is None:

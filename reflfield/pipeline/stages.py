@@ -22,25 +22,36 @@ from reflfield.errors import InputError
 from reflfield.observations.store import check_place
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline import (
+    alignment,
+    atlas,
     comparison,
+    completion,
+    compression,
+    held_out_silhouettes,
+    hull,
     indirect,
+    maps,
     model_selection,
-    outputs,
+    observations,
     publishing,
     rate_distortion,
-    reflectance,
-    surface,
+    report,
+    resampling,
+    silhouettes,
+    visibility,
+    without_alignment,
 )
 from reflfield.pipeline.cache import plain
 from reflfield.pipeline.code_digests import code_digest
+from reflfield.pipeline.compared_photographs import frame_sets
 from reflfield.pipeline.context import Job
 from reflfield.pipeline.hold_out import held_out_counts
 from reflfield.pipeline.memory import check_memory
 from reflfield.pipeline.pipeline_options import PipelineOptions
-from reflfield.pipeline.quantising import held_out
+from reflfield.pipeline.quantisation_search import held_out
+from reflfield.util import progress
 from reflfield.util.file_digests import FileDigests
 from reflfield.util.folders import only_run
-from reflfield.util.progress import report
 
 log = logging.getLogger(__name__)
 # In the folder of the stages: digests of the files that were read.
@@ -101,7 +112,7 @@ def field_metadata_digest(job: Job) -> dict[str, str]:
 
 def frames_digests(job: Job) -> dict[str, str]:
     """Digests of the frames that fields are compared on."""
-    sets = comparison.frame_sets(job)
+    sets = frame_sets(job)
     return {name: job.digest_of(frames) for name, frames in sets.items()}
 
 
@@ -138,7 +149,7 @@ def try_candidates(job: Job, folder: Path) -> Mapping[str, Any]:
     found = model_selection.candidates(job)
     tried: list[tuple[model_selection.Candidate, Job]] = []
     for i, candidate in enumerate(found):
-        report(f"trial of {candidate.name}", i, len(found))
+        progress.report(f"trial of {candidate.name}", i, len(found))
         folders = [job.stages, *(trial.stages for _, trial in tried)]
         trial = model_selection.trial_of(job, candidate, folders)
         for stage in ORDER[: STAGES.index("comparison") + 1]:
@@ -154,13 +165,13 @@ ORDER = (
     # silhouettes, given or made from the photographs
     Stage(
         "silhouettes",
-        surface.write_silhouettes,
+        silhouettes.write_silhouettes,
         reads=lambda job: {"capture": job.digest_of(job.training, "cameras", "silhouettes")},
     ),
     # silhouettes -> watertight mesh that encloses the object
     Stage(
         "hull",
-        surface.write_hull,
+        hull.write_hull,
         after=("silhouettes",),
         options=lambda options: options.hull,
         reads=lambda job: {"lights": job.digest_of(job.training, "lights")},
@@ -168,37 +179,37 @@ ORDER = (
     # mesh -> UV charts -> texel table
     Stage(
         "atlas",
-        surface.write_atlas,
+        atlas.write_atlas,
         after=("hull",),
         options=lambda options: (options.atlas, options.texture),
     ),
     # which camera and which light each texel sees
     Stage(
         "visibility",
-        surface.write_visibility,
+        visibility.write_visibility,
         after=("atlas",),
         options=lambda options: options.visibility,
     ),
     # photographs -> apparent BRDF samples per texel
     Stage(
         "observations",
-        reflectance.write_observations,
+        observations.write_observations,
         after=("visibility",),
         reads=lambda job: {"photographs": job.digest_of(job.training, "photographs")},
-        intact=reflectance.lost_observations,
+        intact=observations.lost_observations,
     ),
     # silhouettes of the frames that fields are compared on, all photographs considered
     Stage(
-        comparison.SILHOUETTES,
-        comparison.write_silhouettes_of_frames,
+        held_out_silhouettes.SILHOUETTES,
+        held_out_silhouettes.write_silhouettes_of_frames,
         after=("hull",),
-        reads=comparison.silhouettes_digests,
+        reads=held_out_silhouettes.silhouettes_digests,
     ),
     # what is open is settled by trials on the held-out frames
     Stage(
         model_selection.STAGE,
         try_candidates,
-        after=("observations", comparison.SILHOUETTES),
+        after=("observations", held_out_silhouettes.SILHOUETTES),
         options=lambda options: (
             options.indirect,
             options.completion,
@@ -222,21 +233,21 @@ ORDER = (
     # scattered directions -> common grid; missing samples filled
     Stage(
         "completion",
-        reflectance.write_completion,
+        completion.write_completion,
         after=("observations",),
         options=lambda options: (options.completion, options.resampling, options.seed),
     ),
     # one local frame per texel
     Stage(
         "alignment",
-        reflectance.write_alignment,
+        alignment.write_alignment,
         after=("completion",),
         options=lambda options: (options.alignment, options.seed),
     ),
     # raw samples again, in the aligned frames, on the grid; missing samples filled
     Stage(
         "resampling",
-        reflectance.write_resampling,
+        resampling.write_resampling,
         after=("alignment",),
         options=lambda options: (
             options.compression.rank,
@@ -247,17 +258,17 @@ ORDER = (
     # clustered local PCA, fitted to the raw samples -> field file
     Stage(
         "compression",
-        reflectance.write_compression,
+        compression.write_compression,
         after=("resampling", "indirect"),
         options=lambda options: (options.compression, options.seed),
         reads=field_metadata_digest,
     ),
     # the field's frames as pictures, the mesh with its mean texture
-    Stage("maps", outputs.write_maps, after=("compression",)),
+    Stage("maps", maps.write_maps, after=("compression",)),
     # the same in the base frames, to compare with
     Stage(
         "without_alignment",
-        reflectance.write_without_alignment,
+        without_alignment.write_without_alignment,
         after=("compression",),
         options=lambda options: (options.compression, options.resampling, options.seed),
         reads=field_metadata_digest,
@@ -267,7 +278,7 @@ ORDER = (
     Stage(
         "comparison",
         comparison.write_comparison,
-        after=("compression", "without_alignment", comparison.SILHOUETTES),
+        after=("compression", "without_alignment", held_out_silhouettes.SILHOUETTES),
         options=relit_with,
         reads=lambda job: {
             **frames_digests(job),
@@ -278,7 +289,7 @@ ORDER = (
     Stage(
         "rate_distortion",
         rate_distortion.write_rate_distortion,
-        after=("compression", "without_alignment", comparison.SILHOUETTES),
+        after=("compression", "without_alignment", held_out_silhouettes.SILHOUETTES),
         options=relit_with,
         reads=frames_digests,
         wanted=lambda job: job.options.shows_rate_distortion,
@@ -286,7 +297,7 @@ ORDER = (
     # everything that was found, in one page
     Stage(
         "report",
-        outputs.write_report_page,
+        report.write_report_page,
         after=("choices", "maps", "comparison", "rate_distortion"),
         options=shown,
         reads=read_by_report,

@@ -20,12 +20,13 @@ from typing import Any
 
 from reflfield import cli
 from reflfield.observations import store
-from reflfield.pipeline import surface, texel_columns
+from reflfield.pipeline import silhouettes, texel_columns, visibility
 from reflfield.util.blocks import Blocks
 
 store.LEAST_TEXELS_PER_CHUNK, store.CHUNK_BYTES, store.VIEWS_PER_CHUNK = 64, 1 << 10, 1
 texel_columns.COLUMNS_AT_ONCE = 25
-surface.DIRECTIONS_AT_ONCE = 2
+silhouettes.VIEWS_AT_ONCE = 2
+visibility.DIRECTIONS_AT_ONCE = 2
 # What a block takes longer, so that a moment in the middle of one is met.
 SECONDS = 0.04
 

@@ -33,9 +33,9 @@ SHORT = (
 KILLED_IN_A_TRIAL = """
 import os, signal
 import reflfield.cli as cli
-from reflfield.pipeline import evaluation
+from reflfield.pipeline import comparison
 
-compare, done = evaluation.compare_with_photographs, []
+compare, done = comparison.compare_with_photographs, []
 
 def killed(*arguments):
     if len(done) == 2:  # held-out and unseen frames of the first
@@ -43,7 +43,7 @@ def killed(*arguments):
     done.append(arguments)
     return compare(*arguments)
 
-evaluation.compare_with_photographs = killed
+comparison.compare_with_photographs = killed
 cli.main()
 """
 # Of a texel five samples count on average, less than eight; with shadows, more.

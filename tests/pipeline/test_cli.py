@@ -75,7 +75,7 @@ class TestExitStatus:
         def stopped(*_, **__):
             signal.raise_signal(number)
 
-        monkeypatch.setattr("reflfield.pipeline.surface.visual_hull", stopped)
+        monkeypatch.setattr("reflfield.pipeline.hull.visual_hull", stopped)
         handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
         monkeypatch.setattr(signal, "getsignal", lambda number: signal.SIG_DFL)
         outcome = reflfield("run", tiny_capture, "-o", tmp_path / "out")
@@ -91,7 +91,7 @@ class TestExitStatus:
         def broken(*_, **__):
             raise KeyError("defect")
 
-        monkeypatch.setattr("reflfield.pipeline.surface.visual_hull", broken)
+        monkeypatch.setattr("reflfield.pipeline.hull.visual_hull", broken)
         with pytest.raises(KeyError, match="defect"):
             reflfield("run", tiny_capture, "-o", tmp_path / "out")
         assert not (tmp_path / "out" / "stages" / "hull.partial").exists()

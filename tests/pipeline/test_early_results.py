@@ -24,7 +24,7 @@ BARE = (
             {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr"},
         ),
         (
-            "reflfield.pipeline.outputs.report_content",
+            "reflfield.pipeline.report.report_content",
             OSError(122, "Disk quota exceeded"),
             {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
              "metrics.json"},

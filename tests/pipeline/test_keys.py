@@ -254,9 +254,9 @@ def test_code(capture_folder, usual, monkeypatch):
     monkeypatch.setattr(
         stages,
         "code_digest",
-        lambda module: digests(module) + "changed" * (module == "reflfield.pipeline.outputs"),
+        lambda module: digests(module) + "changed" * (module == "reflfield.pipeline.report"),
     )
-    assert changed(usual, keys(capture_folder)) == {"maps", "report"}
+    assert changed(usual, keys(capture_folder)) == {"report"}
 
 
 # --- files --------------------------------------------------------------------------------

@@ -1,137 +1,60 @@
-"""What a run shows of its results: pictures, meshes, the report."""
+"""Stage "report": all results in one page."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.encoding import encode_srgb
-from reflfield.capture.image_writing import write_exr
-from reflfield.export.gltf import write_glb
 from reflfield.field.file import describe, open_field
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.metrics.held_out_photographs import RelitPairs, mean_sample
+from reflfield.metrics.held_out_photographs import RelitPairs
 from reflfield.metrics.image_metrics import Comparison
-from reflfield.observations.store import ObservationStore
 from reflfield.pipeline import comparison, hold_out, model_selection
+from reflfield.pipeline.atlas import METHOD
 from reflfield.pipeline.cache import plain, versions
+from reflfield.pipeline.compared_photographs import frame_sets
 from reflfield.pipeline.context import Job
-from reflfield.pipeline.quantising import missed_quality
+from reflfield.pipeline.held_out_silhouettes import silhouettes_of_frames
+from reflfield.pipeline.hull import LEFT_OUT
+from reflfield.pipeline.maps import AVERAGES
+from reflfield.pipeline.quantisation_search import missed_quality
 from reflfield.pipeline.rate_distortion import stored_points
 from reflfield.pipeline.sample_bookkeeping import accounts_of
-from reflfield.pipeline.surface import LEFT_OUT, METHOD
+from reflfield.pipeline.truth_comparison import TruthScores, truth_scores
 from reflfield.report import sections
 from reflfield.report.page import ReportContent, Section, write_report
-from reflfield.report.pictures import texture
 
 # Sets of frames that are compared: title and sentence.
 FRAME_TITLES = {
     "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
     "truth": ("Unseen views and lights", "Simulated from cameras and lights off the rig."),
 }
-# Memory of one such sample: RGB as half and as float, whether it is observed, twice.
-SAMPLE_BYTES = 24
-AVERAGES = "averages.npz"
-
-
-def write_maps(job: Job, folder: Path) -> dict[str, Any]:
-    """Pictures in texture space, and the mesh with its mean texture."""
-    field = open_field(job.stages.root / "compression" / "field.rfld")
-    _write_maps(job, field, folder)
-    average = average_samples(job, folder)
-    np.savez_compressed(folder / AVERAGES, average=average)
-    _write_mesh(job, average, folder)
-    return {"texels with samples": int(np.isfinite(average).all(axis=1).sum())}
 
 
 def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
     """The page: everything that was found."""
     field = open_field(job.stages.root / "compression" / "field.rfld")
-    scores = comparison.truth_scores(job, field)
+    scores = truth_scores(job, field)
     content = report_content(job, field, job.result("maps", AVERAGES)["average"], scores)
     write_report(folder / "index.html", content)
     problems = scores.problems if scores is not None else ()
     return {"sections": len(content.sections), comparison.PROBLEMS: list(problems)}
 
 
-def _write_maps(job: Job, field: ReflectanceField, folder: Path) -> None:
-    texel_of_pixel = job.texels.texel_of_pixel
-    frames = field.local_from_world
-    for name, row in (("normals", 2), ("tangents", 0)):
-        image = texture(frames[:, row], texel_of_pixel, nothing=0.0)
-        write_exr(folder / f"{name}.exr", image.astype(np.float32))
-
-
-def average_samples(job: Job, folder: Path) -> NDArray[np.float32]:
-    """Mean observed sample of every texel, (n_texels, 3); NaN where there is none."""
-    store = job.base_reader.store
-    each = SAMPLE_BYTES * store.observed.pairs.size
-    step = int(np.clip(job.resources.block_bytes // each, 1, store.texels_per_chunk))
-    found = job.blocks(folder).map(
-        "mean samples",
-        averages_block,
-        Averaging(store, step),
-        job.base_reader.blocks_of(np.arange(store.n_texels)),
-    )
-    return found.joined("averages")
-
-
-@dataclass(frozen=True, eq=False)
-class Averaging:
-    """What all blocks of texels share whose samples are averaged.
-
-    Parameters
-    ----------
-    store : ObservationStore
-    step : int
-        Texels at a time; the averages do not depend on it.
-    """
-
-    store: ObservationStore
-    step: int
-
-
-def averages_block(context: Averaging, texels: NDArray[np.intp]) -> dict[str, Any]:
-    """Mean observed sample of some adjacent texels."""
-    parts = []
-    observed = context.store.observed
-    for first in range(texels[0], texels[-1] + 1, context.step):
-        part = slice(first, min(first + context.step, texels[-1] + 1))
-        seen = observed.views[part, :, None] & observed.lights[part, None, :] & observed.pairs
-        parts.append(mean_sample(context.store.read(part), seen) * context.store.unit)
-    return {"averages": np.concatenate(parts).astype(np.float32)}
-
-
-def _write_mesh(job: Job, average: NDArray[np.float32], folder: Path) -> None:
-    """Mesh with UVs and the mean texture, bright enough to look at."""
-    known = np.nan_to_num(average)
-    white = np.percentile(known.max(axis=1), 99) or 1.0
-    texels = job.texels.texel_of_pixel
-    picture = encode_srgb(np.clip(known / white, 0, 1))[np.maximum(texels, 0)]
-    picture = np.where(texels[..., None] >= 0, picture, 0)
-    write_glb(folder / "atlas.glb", job.surface_atlas, np.rint(picture * 255).astype(np.uint8))
-
-
-# --- report -------------------------------------------------------------------------------
-
-
 def report_content(
     job: Job,
     field: ReflectanceField,
     average: NDArray[np.float32],
-    scores: comparison.TruthScores | None,
+    scores: TruthScores | None,
 ) -> ReportContent:
     """All sections of the page, in the order of the stages."""
-    compared = {
-        name: comparison.comparison_of(job, name) for name in comparison.frame_sets(job)
-    }
+    compared = {name: comparison.comparison_of(job, name) for name in frame_sets(job)}
     main = compared.get("heldout") or compared.get("truth")
     parts = [
         *_frames_sections(job, compared),
@@ -297,7 +220,7 @@ def _choices_sections(job: Job) -> Iterator[Section]:
         relit = RelitPairs(
             job.held_frames,
             folder / "heldout",
-            comparison.silhouettes_of_frames(job, "heldout", job.held_frames),
+            silhouettes_of_frames(job, "heldout", job.held_frames),
         )
         pairs.append(relit.measured_in(measured))
         tried.append(
@@ -348,7 +271,7 @@ def _alignment_section(job: Job) -> Section:
 
 
 def _truth_sections(
-    scores: comparison.TruthScores | None, compared: Comparison | None
+    scores: TruthScores | None, compared: Comparison | None
 ) -> Iterator[Section]:
     if scores is not None:
         yield sections.truth_section(

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.factorization import Completion
 from reflfield.field.clustered_model import ClusteredModel, of_usual_size
 from reflfield.field.clustered_pca import CompressionOptions, cluster_completed, fill_unobserved
 from reflfield.field.coefficients import solve_coefficients
@@ -17,50 +16,14 @@ from reflfield.field.fineness import finer_sides, on_finer_nodes
 from reflfield.field.fit import SampleFitOptions, fit_basis
 from reflfield.field.frame_refinement import improved_block as turned
 from reflfield.observations.texel_reading import TexelReader
+from reflfield.pipeline.alignment import local_frames
 from reflfield.pipeline.context import Job
-from reflfield.pipeline.quantising import FieldMaker
+from reflfield.pipeline.quantisation_search import FieldMaker
+from reflfield.pipeline.resampling import Resampled
 from reflfield.util.blocks import Blocks
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
-
-
-@dataclass(frozen=True, eq=False)
-class AlignedFrames:
-    """Frames that a field is fitted in.
-
-    Parameters
-    ----------
-    local_from_base : (n_texels, 3, 3) float64
-    free : (k,) int
-        Texels whose frames were found, and may be improved while the field is fitted.
-    """
-
-    local_from_base: NDArray[np.float64]
-    free: Indices
-
-
-@dataclass(frozen=True, eq=False)
-class Resampled:
-    """Texels on the grids of their frames, what was not observed of them filled.
-
-    Parameters
-    ----------
-    frames : AlignedFrames
-    completion : Completion
-        Of the texels that shape the basis.
-    coefficients : (n_texels, rank) float32
-        Of all texels in that basis.
-    """
-
-    frames: AlignedFrames
-    completion: Completion
-    coefficients: Floats
-
-
-def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
-    """Frames of the texels in the world, from their turns against the base frames."""
-    return (local_from_base @ job.texels.local_from_world).astype(np.float32)
 
 
 def fitted_model(

@@ -1,0 +1,135 @@
+"""Stage "completion": samples on a common grid, missing ones filled."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.factorization import Completion, complete
+from reflfield.observations.texel_reading import TexelReader
+from reflfield.options import Resources
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.memory import columns_at_once
+from reflfield.pipeline.texel_columns import Inference, Resampling, half_columns, inferred
+from reflfield.util.blocks import Blocks
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+# Share of the memory that the columns of a completion may take while it is fitted.
+COLUMNS_SHARE = 1 / 3
+
+
+def write_completion(job: Job, folder: Path) -> dict[str, Any]:
+    """Texels resampled in their base frames, and what was not observed of them filled."""
+    options = job.options.completion
+    chosen = job.training_texels(options.training_texels)
+    found, coefficients = completed(
+        job.base_reader,
+        chosen,
+        job.seen_texels,
+        rank=options.rank,
+        passes=options.passes,
+        method=options.method,
+        seed=job.options.seed,
+        resources=job.resources,
+        blocks=job.blocks(folder),
+    )
+    write_completion_arrays(folder / "completion.npz", found, coefficients)
+    return {
+        "texels that shape the basis": len(chosen),
+        "texels completed": len(job.seen_texels),
+        "texels without samples": job.base_reader.n_texels - len(job.seen_texels),
+        "samples observed": job.observed.count(),
+        "share of nodes observed": float(found.coverage.mean()),
+        "residual": float(found.residuals[-1]),
+    }
+
+
+def completed(
+    reader: TexelReader,
+    chosen: Indices,
+    seen: Indices,
+    *,
+    rank: int,
+    resources: Resources,
+    blocks: Blocks,
+    passes: int = 4,
+    method: Literal["map", "brand"] = "map",
+    seed: int = 0,
+) -> tuple[Completion, Floats]:
+    """Completion shaped by the chosen texels, and coefficients of all.
+
+    The columns of the chosen texels are kept in memory, or in a temporary folder where they
+    are too many; the result depends on neither.
+
+    Returns
+    -------
+    completion : Completion
+    coefficients : (n_texels, rank) float32
+        Zero (the mean) for texels without samples.
+    """
+    context = Resampling(reader, resources.block_bytes)
+
+    def basis() -> dict[str, NDArray[Any]]:
+        blocks.folder.mkdir(exist_ok=True)
+        with TemporaryDirectory(dir=blocks.folder, prefix="columns.") as folder:
+            columns = half_columns(
+                blocks, context, chosen, int(resources.max_memory * COLUMNS_SHARE), Path(folder)
+            )
+            found = complete(
+                columns,
+                rank=rank,
+                passes=passes,
+                method=method,
+                n_channels=3 // reader.weight_channels,
+                seed=seed,
+            )
+        return arrays_of(found)
+
+    found = completion_of(blocks.once("basis", basis))
+    coefficients = np.zeros((reader.n_texels, found.rank), np.float32)
+    coefficients[chosen] = found.coefficients
+    others = np.setdiff1d(seen, chosen)
+    if len(others):
+        parts = blocks.map(
+            "completing all texels",
+            inferred,
+            Inference(found, context),
+            reader.blocks_of(others),
+            at_once=columns_at_once(resources, reader.n_pairs),
+        )
+        coefficients[others] = parts.joined("coefficients")
+    return found, coefficients
+
+
+def arrays_of(found: Completion) -> dict[str, NDArray[Any]]:
+    """Entries of a completion as arrays."""
+    return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+
+
+def completion_of(stored: dict[str, Any]) -> Completion:
+    """Completion from its entries as arrays."""
+    numbers: dict[str, Any] = {
+        "noise": float(stored["noise"]),
+        "residuals": tuple(stored["residuals"].tolist()),
+        "restarts": int(stored["restarts"]),
+    }
+    return Completion(**{**stored, **numbers})
+
+
+def write_completion_arrays(path: Path, found: Completion, coefficients: Floats) -> None:
+    """Store what later stages need of a completion."""
+    np.savez(
+        path,
+        basis=found.basis.astype(np.float32),
+        mean=found.mean.astype(np.float32),
+        coefficients=coefficients,
+        noise=np.array(found.noise),
+        residuals=np.array(found.residuals),
+    )

@@ -1,0 +1,78 @@
+"""Stage "compression": clustered local PCA, fitted to the samples, to a field file."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.file import write_field
+from reflfield.metrics.sample_residual import sample_error
+from reflfield.pipeline.alignment import aligned_frames
+from reflfield.pipeline.cache import plain
+from reflfield.pipeline.completion import completion_of
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.model_fitting import fitted_model
+from reflfield.pipeline.quantisation_search import FieldMaker
+from reflfield.pipeline.resampling import ALL_COEFFICIENTS, Resampled
+
+Floats = NDArray[np.float32]
+
+
+def write_compression(job: Job, folder: Path) -> dict[str, Any]:
+    """Clusters, mean, basis and coefficients of the aligned texels -> field."""
+    stored = job.result("resampling", "resampling.npz")
+    coefficients = stored.pop(ALL_COEFFICIENTS)
+    found = Resampled(aligned_frames(job), completion_of(stored), coefficients)
+    maker = FieldMaker(job, job.options.compression, plain(job.options))
+    return write_compressed(found, maker, folder)
+
+
+def write_compressed(found: Resampled, maker: FieldMaker, folder: Path) -> dict[str, Any]:
+    """Fit a field in the given frames, write it, and measure it on the samples."""
+    job = maker.job
+    model, reader = fitted_model(maker, found, job.blocks(folder))
+    made = maker.made(model, reader.local_from_world)
+    write_field(folder / "field.rfld", made)
+    write_model(folder / "model.npz", model, reader.local_from_world)
+    size = (folder / "field.rfld").stat().st_size
+    raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
+    error = sample_error(made, job.base_reader, job.seen_texels)
+    n_fitted = len(job.seen_texels)
+    counted = reader.count_fitted(np.flatnonzero(job.sampled.any(axis=1)))
+    return {
+        "texels fitted": n_fitted,
+        "texels that repeat another": made.n_texels - n_fitted,
+        "samples fitted": counted.fitted,
+        "samples not measured": counted.unmeasured,
+        "clusters": made.n_clusters,
+        "components": made.n_components,
+        "field bytes": size,
+        "raw bytes": raw,
+        "compression ratio": raw / size,
+        "residual in the domain": float(model.residuals[-1]),
+        "relative error of the samples": error.linear,
+        "relative error of their cube roots": error.cube_root,
+        "LDR PSNR of the samples, dB": error.psnr_ldr,
+        "samples measured": error.n_samples,
+    }
+
+
+def write_model(path: Path, model: ClusteredModel, frames: Floats) -> None:
+    """Store a model before it is quantised, and its frames."""
+    arrays: dict[str, Any] = {
+        entry.name: np.asarray(getattr(model, entry.name)) for entry in fields(model)
+    }
+    np.savez(path, local_from_world=frames, **arrays)
+
+
+def stored_model(job: Job, stage: str) -> tuple[ClusteredModel, NDArray[np.float32]]:
+    """Model of a compression stage before it was quantised, and its frames."""
+    arrays: dict[str, Any] = job.result(stage, "model.npz")
+    frames = arrays.pop("local_from_world")
+    residuals = tuple(arrays.pop("residuals").tolist())
+    return ClusteredModel(**arrays, residuals=residuals), frames

@@ -1,0 +1,48 @@
+"""Stage "silhouettes": coverage of every training view, read or made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reflfield.capture.capture import Capture
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.memory import silhouettes_at_once
+from reflfield.pipeline.silhouette_store import SILHOUETTES, store_silhouettes
+
+# Views of one block, and pixels of their silhouettes.
+VIEWS_AT_ONCE = 8
+PIXELS_AT_ONCE = 16 << 20
+
+
+def write_silhouettes(job: Job, folder: Path) -> dict[str, Any]:
+    """Coverage of every training view, read or made, as 8-bit arrays."""
+    capture = job.training
+    found = job.blocks(folder).map(
+        "silhouettes",
+        silhouettes_block,
+        capture,
+        silhouette_runs(capture),
+        at_once=silhouettes_at_once(job),
+    )
+    views = (named for arrays in found for named in arrays.items())
+    store_silhouettes(folder / SILHOUETTES, views)
+    given = sum(path is not None for path in capture.silhouettes)
+    return {"views": capture.n_views, "silhouettes given": given}
+
+
+def silhouettes_block(capture: Capture, views: range) -> dict[str, Any]:
+    """Coverage of some views, 8 bits."""
+    return {
+        f"view{i}": np.rint(capture.read_silhouette(i) * 255).astype(np.uint8) for i in views
+    }
+
+
+def silhouette_runs(capture: Capture) -> list[range]:
+    """Views whose silhouettes are made together: of large images, few."""
+    pixels = max(camera.width * camera.height for camera in capture.cameras)
+    step = int(np.clip(PIXELS_AT_ONCE // pixels, 1, VIEWS_AT_ONCE))
+    n = capture.n_views
+    return [range(i, min(i + step, n)) for i in range(0, n, step)]

@@ -1,0 +1,183 @@
+"""Scores of a finished run against the truth of a simulated capture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reflfield.errors import InputError
+from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.metrics.completion_error import CompletionError, completion_error
+from reflfield.metrics.frame_errors import FrameErrors, frame_errors, surface_points
+from reflfield.metrics.hull_distance import HullDistance, hull_distance
+from reflfield.metrics.truth_files import Truth, open_truth
+from reflfield.observations.frame_resampling import apply_both
+from reflfield.observations.texel_samples import (
+    direction_taps,
+    interpolation_matrices,
+    local_directions,
+    unroot,
+)
+from reflfield.pipeline.context import Job
+from reflfield.sphere.hemisphere import softened_cosine
+
+# Texels farther from a true surface point than this many texel spacings see another part.
+MATCH_SPACINGS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class TruthScores:
+    """Scores against the truth of a simulated capture; None where there is none.
+
+    Parameters
+    ----------
+    hull : HullDistance, optional
+    frames, base_frames : FrameErrors, optional
+    completion : CompletionError, optional
+    problems : tuple of str
+        Files of the truth that could not be used, and why.
+    """
+
+    hull: HullDistance | None = None
+    frames: FrameErrors | None = None
+    base_frames: FrameErrors | None = None
+    completion: CompletionError | None = None
+    problems: tuple[str, ...] = ()
+
+
+def truth_scores(job: Job, field: ReflectanceField) -> TruthScores | None:
+    """All scores against the truth; without what of it is damaged. None without a truth."""
+    try:
+        truth = open_truth(job.capture.root)
+    except InputError as error:
+        return TruthScores(problems=(f"truth: not compared: {error}",))
+    if truth is None:
+        return None
+    problems: list[str] = []
+
+    def score(of: Callable[[], Any]) -> Any:
+        try:
+            return of()
+        except InputError as error:
+            problems.append(f"truth: not compared: {error}")
+            return None
+
+    hull = None if job.is_plane else score(lambda: hull_score(job, truth))
+    frames, base = score(lambda: frame_scores(job, truth, field)) or (None, None)
+    completion = score(lambda: completion_score(job, truth))
+    return TruthScores(hull, frames, base, completion, tuple(problems))
+
+
+def hull_score(job: Job, truth: Truth) -> HullDistance:
+    """Distance of the hull to the true surface, also in voxels of the hull's grid."""
+    details = json.loads((job.stages.root / "hull" / "hull.json").read_text())
+    mesh = job.hull_mesh
+    return hull_distance(
+        (mesh.vertices, mesh.faces), truth.mesh(), voxel=details.get("spacing")
+    )
+
+
+def frame_scores(
+    job: Job, truth: Truth, field: ReflectanceField
+) -> tuple[FrameErrors, FrameErrors] | None:
+    """Angles of the recovered and of the base frames to the true shading frames.
+
+    One turn about the normal is free for each target and material; of the base frames, which
+    have no target, for each material.
+    """
+    cameras = [c for c in job.training.cameras if truth.has_view(c.id)]
+    if not cameras:
+        return None
+    surface = surface_points(truth.view(c.id, (c.width, c.height)) for c in cameras)
+    seen = job.seen_texels
+    reach = MATCH_SPACINGS * job.texels.spacing
+    position = job.texels.position[seen]
+    target = job.result("alignment", "alignment.npz")["cluster"][seen]
+    return (
+        frame_errors(position, field.local_from_world[seen], surface, reach, target),
+        frame_errors(position, job.texels.local_from_world[seen], surface, reach, 0 * target),
+    )
+
+
+def completion_score(job: Job, truth: Truth) -> CompletionError | None:
+    """Error of the completed nodes against true apparent BRDFs, seen and unseen.
+
+    At every surface point whose full apparent BRDF the truth holds, the nearest texel's
+    completed function is evaluated for all its directions.
+    """
+    points = truth.samples()
+    if points is None or not job.training.lights_known:
+        return None
+    counts, expected = points["samples"].shape[1:3], (job.capture.n_views, job.capture.n_lights)
+    if counts != expected:
+        raise InputError(
+            f"{truth.path('abrdf', '')}: samples: expected the capture's {expected[0]} views "
+            f"and {expected[1]} lights, received {counts[0]} and {counts[1]}"
+        )
+    return _completion_at(job, points)
+
+
+def _completion_at(job: Job, points: dict[str, NDArray[Any]]) -> CompletionError | None:
+    seen = job.seen_texels
+    distance, nearest = cKDTree(job.texels.position[seen]).query(points["position"])
+    close = np.flatnonzero(distance < MATCH_SPACINGS * job.texels.spacing)
+    if not len(close):
+        return None
+    texels = seen[nearest[close]]
+    completed = completed_samples(job, texels, points["views"][close], points["lights"][close])
+    # Shadows are traced when rendering; what a shadowed sample would be is not asked.
+    lit = points["light_visible"][close][:, None, :]
+    above = (points["views"][close] * points["frame"][close][:, None, 2]).sum(axis=2) > 0
+    asked = np.broadcast_to(lit & above[:, :, None], completed.shape[:3])
+    used = np.zeros(asked.shape, bool)
+    training = np.ix_(
+        np.arange(len(close)),
+        job.split.training_views,
+        job.split.training_lights,
+    )
+    measured = job.observed
+    used[training] = (
+        measured.views[texels][:, :, None]
+        & measured.lights[texels][:, None, :]
+        & measured.pairs[None]
+    )
+    return completion_error(completed[asked], points["samples"][close][asked], used[asked])
+
+
+def completed_samples(
+    job: Job, texels: NDArray[np.intp], views: NDArray[Any], lights: NDArray[Any]
+) -> NDArray[np.float32]:
+    """Samples of completed texels for directions of the world.
+
+    Parameters
+    ----------
+    job : Job
+        With its completion stage done.
+    texels : (n,) int
+    views, lights : (n, k, 3) float
+        Unit vectors.
+
+    Returns
+    -------
+    (n, n_views, n_lights, 3) float32
+        1/sr, cosine included, without cast shadows.
+    """
+    stored = job.result("completion", "completion.npz")
+    sides, domain = job.sides, job.options.resampling.domain
+    columns = stored["mean"] + stored["coefficients"][texels] @ stored["basis"].T
+    nodes = columns.reshape(len(texels), sides[0] ** 2, sides[1] ** 2, 3)
+    frames = job.texels.local_from_world[texels]
+    local = [local_directions(frames, d.astype(np.float32)) for d in (views, lights)]
+    at_views, at_lights = (
+        interpolation_matrices(direction_taps(d, side), side)
+        for d, side in zip(local, sides, strict=True)
+    )
+    values = np.maximum(unroot(apply_both(at_views, at_lights, nodes), domain), 0)
+    cosine = softened_cosine(local[1][..., 2]) if sides[1] > 1 else np.ones(lights.shape[:2])
+    return (values * cosine[:, None, :, None]).astype(np.float32)

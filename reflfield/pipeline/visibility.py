@@ -1,0 +1,121 @@
+"""Stage "visibility": which camera and which light each texel sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.capture import Capture
+from reflfield.errors import InputError
+from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.occlusion import VisibilityOptions, light_visibility, view_visibility
+from reflfield.geometry.ray_scene import RayScene
+from reflfield.geometry.texels import TexelTable
+from reflfield.pipeline.context import Job
+from reflfield.util.dask_cluster import threads_here
+
+# Views, or lights, of one block.
+DIRECTIONS_AT_ONCE = 8
+
+
+def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
+    """Which camera and which light each texel sees."""
+    capture, texels = job.training, job.texels
+    context = Sight(
+        capture,
+        texels,
+        job.surface_atlas.mesh,
+        job.options.visibility,
+        [None] * capture.n_views if job.is_plane else covered_pixels(job),
+        job.resources.workers,
+    )
+    view_runs, light_runs = runs(capture.n_views), runs(capture.n_lights)
+    named = [("views", run) for run in view_runs] + [("lights", run) for run in light_runs]
+    # The rays have threads of their own.
+    found = job.blocks(folder).map("visibility", sight_block, context, named, at_once=1)
+    columns = [arrays["seen"] for arrays in found]
+    views = np.concatenate(columns[: len(view_runs)], axis=1)
+    lights = np.concatenate(columns[len(view_runs) :], axis=1)
+    if not views.any():
+        raise InputError(
+            "cameras: expected at least one that sees the surface, found none; check the "
+            "calibration against the silhouettes"
+        )
+    np.savez_compressed(folder / "visibility.npz", views=views, lights=lights)
+    return {
+        "texels": len(texels),
+        "texels that no camera sees": int((~views.any(axis=1)).sum()),
+        "views per texel": float(views.sum(axis=1).mean()),
+        "lights per texel": float(lights.sum(axis=1).mean()),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What all blocks of views and lights share whose visibility is traced.
+
+    Parameters
+    ----------
+    capture : Capture
+    texels : TexelTable
+    mesh : Mesh
+    options : VisibilityOptions
+    covered : sequence of (n,) uint8 or None
+        Pixels of the views that the object covers, row by row, eight in a byte.
+    threads : int
+        For rays; a cluster's worker uses its own number.
+    """
+
+    capture: Capture
+    texels: TexelTable
+    mesh: Mesh
+    options: VisibilityOptions
+    covered: Sequence[NDArray[np.uint8] | None]
+    threads: int
+
+    def silhouette(self, view: int) -> NDArray[np.bool_] | None:
+        """Pixels (h, w) of a view that the object covers."""
+        bits, camera = self.covered[view], self.capture.cameras[view]
+        if bits is None:
+            return None
+        pixels = np.unpackbits(bits, count=camera.width * camera.height)
+        return pixels.reshape(camera.height, camera.width).astype(np.bool_)
+
+
+def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
+    """Which texels some views or lights see, (n_texels, k)."""
+    kind, some = block
+    scene = RayScene(context.mesh, threads=threads_here(context.threads))
+    capture, texels, options = context.capture, context.texels, context.options
+    if kind == "views":
+        columns = [
+            view_visibility(
+                texels, scene, capture.cameras[i], options, silhouette=context.silhouette(i)
+            )
+            for i in some
+        ]
+    else:
+        columns = [light_visibility(texels, scene, capture.lights[i], options) for i in some]
+    return {"seen": np.stack(columns, axis=1)}
+
+
+def covered_pixels(job: Job) -> list[NDArray[np.uint8]]:
+    """Pixels of each view that count as covered by the object, eight in a byte."""
+    least = job.options.visibility.coverage
+    return [np.packbits(silhouette >= least) for silhouette in job.view_silhouettes]
+
+
+def runs(n: int) -> list[range]:
+    """Views or lights that are handled together.
+
+    Examples
+    --------
+    >>> runs(20)
+    [range(0, 8), range(8, 16), range(16, 20)]
+    """
+    return [range(i, min(i + DIRECTIONS_AT_ONCE, n)) for i in range(0, n, DIRECTIONS_AT_ONCE)]

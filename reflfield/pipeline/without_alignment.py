@@ -1,0 +1,36 @@
+"""Stage "without_alignment": the same field in the base frames, to compare with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reflfield.field.file import open_field
+from reflfield.pipeline.alignment import AlignedFrames
+from reflfield.pipeline.cache import plain
+from reflfield.pipeline.compression import write_compressed
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.pipeline_options import AlignmentOptions
+from reflfield.pipeline.quantisation_search import FieldMaker
+from reflfield.pipeline.resampling import resampled
+
+
+def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
+    """The same in the base frames: as many clusters and components, and a file as large."""
+    base = np.tile(np.eye(3), (job.base_reader.n_texels, 1, 1))
+    frames = AlignedFrames(base, np.zeros(0, np.intp))
+    made_with = plain(replace(job.options, alignment=AlignmentOptions(enabled=False)))
+    del made_with["completion"]
+    aligned_field = open_field(job.stages.root / "compression" / "field.rfld")
+    alike = replace(
+        job.options.compression,
+        n_clusters=aligned_field.n_clusters,
+        n_components=aligned_field.n_components,
+        size=(job.stages.root / "compression" / "field.rfld").stat().st_size,
+        psnr=0.0,
+    )
+    found = resampled(job, frames, alike, job.blocks(folder))
+    return write_compressed(found, FieldMaker(job, alike, made_with), folder)
