@@ -164,56 +164,6 @@ def fibonacci(n: int, max_inclination: float = np.pi / 2.0) -> Array:
     return spherical(np.arccos(height), azimuth)
 
 
-def held_out(
-    n: int, seed: int, directions: Array, max_inclination: float | None = None
-) -> Array:
-    """Random directions that a rig does not have, well away from its own.
-
-    Parameters
-    ----------
-    n : int
-        Number of new directions.
-    seed : int
-        Chooses them.
-    directions : (m, 3) float64
-        The rig, unit vectors.
-    max_inclination : float, optional
-        Half angle of the cap they are drawn from, radians; that of the rig if not
-        given (at least 15 degrees).
-
-    Returns
-    -------
-    (n, 3) float64
-        Each lies farther from the rig than the middle one of many random
-        directions, and they keep apart from one another.
-
-    Examples
-    --------
-    >>> new = held_out(3, 1, bonn151())
-    >>> bool(np.degrees(np.arccos((new @ bonn151().T).max(axis=1))).min() > 3.0)
-    True
-    """
-    widest = float(np.arccos(np.clip(directions[:, 2].min(), -1.0, 1.0)))
-    cap = max(widest, np.radians(15.0)) if max_inclination is None else max_inclination
-    rng = np.random.default_rng(seed)
-    n_candidates = max(256, 32 * n)
-    height = rng.uniform(np.cos(cap), 1.0, n_candidates)
-    candidates = spherical(np.arccos(height), rng.uniform(-np.pi, np.pi, n_candidates))
-    nearest = (candidates @ directions.T).max(axis=1)
-    candidates = candidates[nearest <= np.median(nearest)]
-    return _far_apart(candidates, n)
-
-
-def _far_apart(candidates: Array, n: int) -> Array:
-    """Greedy choice: each next one is the farthest from those chosen."""
-    chosen = [0]
-    nearest = candidates @ candidates[0]
-    for _ in range(n - 1):
-        chosen.append(int(np.argmin(nearest)))
-        nearest = np.maximum(nearest, candidates @ candidates[chosen[-1]])
-    return candidates[chosen[:n]]
-
-
 # ------------------------------------------------------------------------- tables
 
 

@@ -88,36 +88,3 @@ def sub_pixel_grid(samples_per_side: int) -> NDArray[np.float64]:
     ticks = (np.arange(samples_per_side) + 0.5) / samples_per_side
     y, x = np.meshgrid(ticks, ticks, indexing="ij")
     return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-def crossed_by_outline(
-    face: NDArray[np.int64], distance: NDArray[np.float32], step: float
-) -> NDArray[np.bool_]:
-    """Find pixels that hold an outline, from their grid of rays.
-
-    Parameters
-    ----------
-    face : (n_pixels, n_rays) int
-        Triangle hit by each ray, -1 for none.
-    distance : (n_pixels, n_rays) float
-        Along the rays, metres; infinite for none.
-    step : float
-        Change of distance within a pixel that counts as an edge, metres.
-
-    Returns
-    -------
-    (n_pixels,) bool
-        True where rays both hit and miss, or distances jump.
-
-    Examples
-    --------
-    >>> face = np.array([[3, 3], [3, -1], [-1, -1]])
-    >>> distance = np.array([[1.0, 1.01], [1.0, np.inf], [np.inf, np.inf]], np.float32)
-    >>> crossed_by_outline(face, distance, step=0.1)
-    array([False,  True, False])
-    """
-    hit = face >= 0
-    partly = hit.any(axis=1) & ~hit.all(axis=1)
-    finite = np.where(hit, distance, 0.0)
-    jumps = hit.all(axis=1) & (np.ptp(finite, axis=1) > step)
-    return partly | jumps

@@ -12,7 +12,7 @@ Conventions, kept by every camera of the package:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -211,34 +211,12 @@ class Camera:
         return towards / np.maximum(distance, np.finfo(np.float64).tiny)
 
     def contains(self, pixels: ArrayLike) -> NDArray[np.bool_]:
-        """Whether pixel coordinates (n, 2) lie in the image; (n,) bool, NaN gives False."""
-        u, v = np.asarray(pixels, dtype=np.float64).T
-        return (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
+        """Whether pixel coordinates (n, 2) lie in the image; (n,) bool, False for NaN.
 
-    def pixel_centres(self) -> Array:
-        """Centres of all pixels, row by row; (height * width, 2) float64.
-
-        Examples
-        --------
-        >>> Camera("v0", "opencv", 2, 1, 1.0, 1.0, 1.0, 0.5, np.eye(4)).pixel_centres()
-        array([[0.5, 0.5],
-               [1.5, 0.5]])
+        The right and the lower border are excluded: each point inside has a pixel.
         """
-        v, u = np.mgrid[: self.height, : self.width]
-        return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=1)
-
-    def resized(self, width: int, height: int) -> Camera:
-        """The same camera with images of another size: intrinsics scale per axis."""
-        sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fl_x=self.fl_x * sx,
-            cx=self.cx * sx,
-            fl_y=self.fl_y * sy,
-            cy=self.cy * sy,
-        )
+        u, v = np.asarray(pixels, dtype=np.float64).T
+        return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
     @cached_property
     def _largest_radius(self) -> float:

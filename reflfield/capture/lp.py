@@ -32,9 +32,7 @@ MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearl
 CAMERA_HEIGHT = 10.0  # metres above the plane; only a sign for an orthographic camera
 
 
-def read_lp(
-    description: Path, *, follow_links: bool = False, image_width: float = IMAGE_WIDTH
-) -> Capture:
+def read_lp(description: Path, *, follow_links: bool = False) -> Capture:
     """Read an RTI capture.
 
     Parameters
@@ -43,8 +41,6 @@ def read_lp(
         The ``.lp`` file.
     follow_links : bool
         Whether symbolic links may lead out of its folder.
-    image_width : float
-        Width of the photographs on the object, metres.
 
     Returns
     -------
@@ -79,7 +75,7 @@ def read_lp(
     return Capture(
         name=printable(root.resolve().name),
         root=root,
-        cameras=(_camera(image_size(paths[0]), image_width),),
+        cameras=(_camera(image_size(paths[0])),),
         lights=lights,
         photographs=tuple(
             Photograph(name, 0, i, (Exposure(path),))
@@ -140,7 +136,7 @@ def _parsed(line: str, description: Path) -> tuple[str, list[float]]:
     return name, numbers
 
 
-def _camera(size: tuple[int, int], image_width: float) -> Camera:
+def _camera(size: tuple[int, int]) -> Camera:
     width, height = size
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = CAMERA_HEIGHT
@@ -149,8 +145,8 @@ def _camera(size: tuple[int, int], image_width: float) -> Camera:
         kind="orthographic",
         width=width,
         height=height,
-        fl_x=width / image_width,
-        fl_y=width / image_width,
+        fl_x=width / IMAGE_WIDTH,
+        fl_y=width / IMAGE_WIDTH,
         cx=width / 2,
         cy=height / 2,
         camera_from_world=pose,

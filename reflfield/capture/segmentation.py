@@ -12,7 +12,6 @@ is a little too large does not: dark parts in doubt are kept, small holes are fi
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -26,55 +25,33 @@ Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class SilhouetteOptions:
-    """How silhouettes are made. Lengths are fractions of the longer image side.
-
-    Parameters
-    ----------
-    border : float
-        Width of the frame whose pixels stand for the backdrop.
-    uniform_spread : float
-        The backdrop counts as uniform if three quarters of the border differ from its
-        median colour by less than this (sRGB-encoded, in [0, 1]); the object may cross the
-        rest.
-    least_contrast : float
-        Difference from the backdrop (encoded) below which nothing is object.
-    margin : float
-        Distance from what is certainly object beyond which all is backdrop.
-    crack : float
-        Gaps up to this width do not part the object.
-    closing : float
-        Notches in the outline up to this width are filled: mostly parts in cast shadow, as
-        dark as the backdrop. Holes are left as they are.
-    smallest_part, smallest_hole : float
-        Parts and holes with a smaller share of the object's area are dropped and filled.
-    soft_edge : float
-        Width of the band beside the outline in which coverage may lie between 0 and 1.
-    grabcut_iterations : int
-        Iterations of GrabCut.
-    grabcut_size : int
-        GrabCut works on an image with at most this longer side, pixels.
-    """
-
-    border: float = 0.015
-    uniform_spread: float = 0.25
-    least_contrast: float = 0.02
-    margin: float = 0.015
-    crack: float = 0.02
-    closing: float = 0.036
-    smallest_part: float = 0.05
-    smallest_hole: float = 0.015
-    soft_edge: float = 0.003
-    grabcut_iterations: int = 6
-    grabcut_size: int = 512
+# Lengths are fractions of the longer image side.
+# Width of the border whose pixels stand for the backdrop.
+BORDER = 0.015
+# The backdrop counts as uniform if three quarters of the border differ from its median colour
+# by less than this (sRGB-encoded, in [0, 1]); the object may cross the rest.
+UNIFORM_SPREAD = 0.25
+# Difference from the backdrop (encoded) below which nothing is object.
+LEAST_CONTRAST = 0.02
+# Distance from what is certainly object beyond which all is backdrop.
+MARGIN = 0.015
+# Gaps up to this width do not part the object.
+CRACK = 0.02
+# Notches in the outline up to this width are filled: mostly parts in cast shadow, as dark as
+# the backdrop. Holes are left as they are.
+CLOSING = 0.036
+# Parts and holes with a smaller share of the object's area are removed and filled.
+SMALLEST_PART = 0.05
+SMALLEST_HOLE = 0.015
+# Width of the band beside the outline in which coverage may lie between 0 and 1.
+SOFT_EDGE = 0.003
+GRABCUT_ITERATIONS = 6
+# GrabCut works on an image with at most this longer side, pixels.
+GRABCUT_SIZE = 512
 
 
 def silhouette_from_photographs(
-    photographs: Iterable[Float32],
-    options: SilhouetteOptions | None = None,
-    *,
-    name: str = "view",
+    photographs: Iterable[Float32], *, name: str = "view"
 ) -> Float32:
     """Coverage of the object in the photographs of one view.
 
@@ -82,8 +59,6 @@ def silhouette_from_photographs(
     ----------
     photographs : iterable of (h, w, 3) float32
         Linear photographs of one view, one per light; taken one at a time.
-    options : SilhouetteOptions, optional
-        Thresholds.
     name : str
         Named in errors.
 
@@ -109,18 +84,17 @@ def silhouette_from_photographs(
     >>> round(float(coverage.sum()))
     400
     """
-    options = options or SilhouetteOptions()
     image = _exposed(_mean(photographs, name))
     encoded = encode_srgb(image)
-    border = _border(image.shape[0], image.shape[1], options.border)
+    border = _border(image.shape[0], image.shape[1], BORDER)
     backdrop = np.median(encoded[border], axis=0)
     difference = np.abs(encoded - backdrop).max(axis=2)
-    uniform = np.quantile(difference[border], 0.75) < options.uniform_spread
+    uniform = np.quantile(difference[border], 0.75) < UNIFORM_SPREAD
     if uniform:
-        inside = _differs_from_backdrop(difference, border, options)
+        inside = _differs_from_backdrop(difference, border)
     else:
-        inside = _grabcut(encoded, border, options)
-    seen, inside = inside, _cleaned(inside, options)
+        inside = _grabcut(encoded, border)
+    seen, inside = inside, _cleaned(inside)
     share = float(inside.mean())
     if not 0.0005 < share < 0.995:
         raise CaptureError(
@@ -130,7 +104,7 @@ def silhouette_from_photographs(
     if not uniform:
         return _smoothed(inside)
     linear_backdrop = np.median(image[border], axis=0)
-    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), seen, inside, options)
+    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), seen, inside)
 
 
 def _mean(photographs: Iterable[Float32], name: str) -> Float32:
@@ -164,22 +138,20 @@ def _border(height: int, width: int, fraction: float) -> Bool:
     return border
 
 
-def _differs_from_backdrop(
-    difference: Float32, border: Bool, options: SilhouetteOptions
-) -> Bool:
+def _differs_from_backdrop(difference: Float32, border: Bool) -> Bool:
     """Pixels that differ from the backdrop, or differ a little and are near such ones.
 
     Both thresholds follow what the backdrop itself varies by; the upper one is at most
     Otsu's, which splits the image's two levels.
     """
-    n = max(3, round(options.margin * max(difference.shape)))
+    n = max(3, round(MARGIN * max(difference.shape)))
     levels = np.clip(difference * 255, 0, 255).astype(np.uint8)
     otsu = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0] / 255
-    bright = (difference > max(otsu, options.least_contrast)).astype(np.uint8)
+    bright = (difference > max(otsu, LEAST_CONTRAST)).astype(np.uint8)
     far = cv2.dilate(bright, _disc(n)) == 0
     variation = _variation(difference, border, far)
-    strong = float(np.clip(3 * variation, 2 * options.least_contrast, max(otsu, 0.1)))
-    weak = float(np.clip(1.25 * variation, options.least_contrast, 0.75 * strong))
+    strong = float(np.clip(3 * variation, 2 * LEAST_CONTRAST, max(otsu, 0.1)))
+    weak = float(np.clip(1.25 * variation, LEAST_CONTRAST, 0.75 * strong))
     smooth = cv2.GaussianBlur(difference, (0, 0), 0.7)
     near = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
     return _touching((smooth > weak) & near, smooth > strong)
@@ -212,30 +184,30 @@ def _touching(candidates: Bool, seeds: Bool) -> Bool:
     return kept[labels]
 
 
-def _grabcut(encoded: Float32, border: Bool, options: SilhouetteOptions) -> Bool:
+def _grabcut(encoded: Float32, border: Bool) -> Bool:
     """Object by GrabCut, seeded with the border as backdrop."""
     height, width = border.shape
-    scale = min(1.0, options.grabcut_size / max(height, width))
+    scale = min(1.0, GRABCUT_SIZE / max(height, width))
     size = (max(8, round(width * scale)), max(8, round(height * scale)))
     small = cv2.resize((encoded * 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
     labels = np.full(small.shape[:2], cv2.GC_PR_FGD, dtype=np.uint8)
-    labels[_border(size[1], size[0], max(options.border, 0.03))] = cv2.GC_BGD
+    labels[_border(size[1], size[0], max(BORDER, 0.03))] = cv2.GC_BGD
     cv2.setRNGSeed(0)  # its k-means draws from OpenCV's global generator
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(small, labels, None, *models, options.grabcut_iterations, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(small, labels, None, *models, GRABCUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
     inside = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.float32)
     return cv2.resize(inside, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def _cleaned(inside: Bool, options: SilhouetteOptions) -> Bool:
+def _cleaned(inside: Bool) -> Bool:
     """Gaps closed, crumbs dropped, small holes filled; large holes keep their shape."""
     longer = max(inside.shape)
-    joined = _closed(inside, max(1, round(options.crack * longer / 2)))
-    parts = _large_parts(joined, options.smallest_part)
+    joined = _closed(inside, max(1, round(CRACK * longer / 2)))
+    parts = _large_parts(joined, SMALLEST_PART)
     solid = ~_large_holes(~parts, float("inf"))
-    least = options.smallest_hole * float(parts.sum())
+    least = SMALLEST_HOLE * float(parts.sum())
     holes = _large_holes(solid & ~parts, least)
-    bridged = _closed(solid, max(1, round(options.closing * longer / 2)))
+    bridged = _closed(solid, max(1, round(CLOSING * longer / 2)))
     return ~_large_holes(~bridged, least) & ~holes
 
 
@@ -276,9 +248,7 @@ def _smoothed(inside: Bool) -> Float32:
     return np.clip(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.8), 0, 1)
 
 
-def _soft_edged(
-    difference: Float32, seen: Bool, inside: Bool, options: SilhouetteOptions
-) -> Float32:
+def _soft_edged(difference: Float32, seen: Bool, inside: Bool) -> Float32:
     r"""Coverage along the outline, from how far each pixel is on its way to the object.
 
     A pixel that the object covers by :math:`\alpha` differs from the backdrop by
@@ -286,7 +256,7 @@ def _soft_edged(
     is taken from just inside the outline. Where the object itself is dark there, or was
     filled in without being seen, the ratio means nothing and the plain outline is kept.
     """
-    n = max(2, round(options.soft_edge * max(inside.shape)))
+    n = max(2, round(SOFT_EDGE * max(inside.shape)))
     disc = _disc(n)
     solid = inside.astype(np.uint8)
     padded = cv2.copyMakeBorder(solid, n, n, n, n, cv2.BORDER_REPLICATE)
@@ -300,12 +270,12 @@ def _soft_edged(
     ratio = np.clip(difference / np.maximum(object_difference, 1e-6), 0, 1)
     band = (cv2.dilate(solid, disc) > 0) & ~core
     soft = np.where(band & trusted, ratio, _smoothed(inside)).astype(np.float32)
-    return _without_specks(soft, options)
+    return _without_specks(soft)
 
 
-def _without_specks(coverage: Float32, options: SilhouetteOptions) -> Float32:
+def _without_specks(coverage: Float32) -> Float32:
     """Coverage without the single pixels that a ratio of dark values leaves behind."""
     solid = coverage > 0.5
-    parts = _large_parts(solid, options.smallest_part)
-    clean = ~_large_holes(~parts, options.smallest_hole * float(parts.sum()))
+    parts = _large_parts(solid, SMALLEST_PART)
+    clean = ~_large_holes(~parts, SMALLEST_HOLE * float(parts.sum()))
     return np.where(clean == solid, coverage, clean).astype(np.float32)

@@ -178,24 +178,6 @@ def unit_or_zero(vectors: ArrayLike) -> Array:
     return array / np.where(lengths > 0.0, lengths, 1.0)
 
 
-def open_edge_count(mesh: Mesh) -> int:
-    """Number of directed edges without exactly one opposite edge.
-
-    Zero for a closed, consistently oriented 2-manifold; the rim of a hole
-    counts once per edge, and so does an edge shared by more than two faces.
-
-    Examples
-    --------
-    >>> open_edge_count(Mesh([[0, 0, 0], [2, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
-    3
-    """
-    forward, backward = _edge_keys(mesh)
-    keys, uses = np.unique(forward, return_counts=True)
-    used_once = keys[uses == 1]
-    paired = np.isin(backward, used_once) & np.isin(forward, used_once)
-    return int(np.count_nonzero(~paired))
-
-
 def _edge_keys(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """One number for each directed edge, and that of the opposite edge; (3 m,) each."""
     start = mesh.faces.ravel().astype(np.int64)

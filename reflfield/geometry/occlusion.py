@@ -9,13 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
-from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.ray_scene import RayScene, row_strips
 from reflfield.geometry.texels import TexelTable
 from reflfield.util.validation import check_ranges, check_shape
@@ -27,7 +26,6 @@ Bools = NDArray[np.bool_]
 _RANGES = {
     "edge_band": (0, 1e6),
     "edge_slope": (0, 1e6),
-    "shadow_band": (0, 1e6),
     "ray_offset": (0, 0.1),
 }
 # Lights that come from everywhere or from nowhere known: no single ray can miss them.
@@ -54,8 +52,6 @@ class VisibilityOptions:
         Start of the rays above the surface, in diagonals of the mesh's bounding box.
     coverage : float
         Least coverage of a pixel by the silhouette, where one is given.
-    shadow_band : float
-        Distance from a shadow's boundary that `shadow_edge` reports, texel spacings.
     """
 
     grazing_cosine: float = 0.15
@@ -64,7 +60,6 @@ class VisibilityOptions:
     edge_slope: float = 10.0
     ray_offset: float = 2e-4
     coverage: float = 0.5
-    shadow_band: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("grazing_cosine", "light_cosine", "coverage"):
@@ -210,49 +205,6 @@ def light_visibility(
     return lit
 
 
-def shadow_edge(
-    texels: TexelTable,
-    scene: RayScene,
-    light: Light,
-    options: VisibilityOptions | None = None,
-    n_rays: int = 8,
-) -> Bools:
-    """Texels so near the boundary of a cast shadow that the geometry's error decides.
-
-    Rays start on a ring of radius `shadow_band` texel spacings around the texel, in its
-    tangent plane and a quarter of the radius above it (concave surfaces down to twice the
-    radius stay below it). The texel is on an edge where some are blocked and some not.
-    Where the surface turns away from the light no edge is reported: the cosine is zero there.
-
-    Parameters
-    ----------
-    texels, scene, light, options
-        As in `light_visibility`.
-    n_rays : int
-        Rays of the ring.
-
-    Returns
-    -------
-    (n,) bool
-    """
-    options = options or VisibilityOptions()
-    on_edge = np.zeros(len(texels), dtype=bool)
-    if light.kind in _WITHOUT_DIRECTION:
-        return on_edge
-    rows = np.flatnonzero(_faces_light(texels, light, options))
-    ring = texels.subset(rows)
-    centre = lifted_positions(ring, scene, options)
-    tangent, binormal, normal = np.moveaxis(ring.local_from_world.astype(np.float64), 1, 0)
-    radius = options.shadow_band * texels.spacing
-    n_blocked = np.zeros(len(rows), dtype=np.int64)
-    for angle in 2.0 * np.pi * np.arange(n_rays) / n_rays:
-        shift = np.cos(angle) * tangent + np.sin(angle) * binormal + 0.25 * normal
-        starts = centre + radius * shift
-        n_blocked += scene.occluded(starts, light.directions(starts), light.distances(starts))
-    on_edge[rows] = (n_blocked > 0) & (n_blocked < n_rays)
-    return on_edge
-
-
 def check_light_outside(scene: RayScene, light: Light) -> None:
     """Refuse a light that stands inside the object.
 
@@ -269,11 +221,6 @@ def check_light_outside(scene: RayScene, light: Light) -> None:
         )
 
 
-def light_inside(mesh: Mesh, position: ArrayLike) -> bool:
-    """Return True if a position (3,) lies inside a watertight mesh."""
-    return bool(RayScene(mesh).inside(np.asarray(position, dtype=np.float64)[None])[0])
-
-
 def _faces_camera(texels: TexelTable, camera: Camera, options: VisibilityOptions) -> Bools:
     """True where the camera is in front of both the smooth and the real surface."""
     towards = camera.view_directions(texels.position)
@@ -282,20 +229,14 @@ def _faces_camera(texels: TexelTable, camera: Camera, options: VisibilityOptions
 
 
 def _on_usable_pixel(texels: TexelTable, camera: Camera, usable: Bools) -> Bools:
-    """True where a texel projects into the frame, onto a pixel that may be sampled."""
+    """True where a texel projects into the image, onto a pixel that may be sampled."""
     pixels, depth = camera.project(texels.position)
     in_front = (depth > 0.0) | (camera.kind == "orthographic")
-    in_frame = np.flatnonzero(in_front & _contains(camera, pixels))
-    col, row = np.floor(pixels[in_frame]).astype(np.int64).T
-    found = np.zeros(len(texels), dtype=bool)
-    found[in_frame] = usable[row, col]
-    return found
-
-
-def _contains(camera: Camera, pixels: Array) -> Bools:
-    """True inside the frame, its right and lower border excluded; False for NaN."""
-    u, v = pixels.T
-    return (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
+    in_image = np.flatnonzero(in_front & camera.contains(pixels))
+    col, row = np.floor(pixels[in_image]).astype(np.int64).T
+    on_usable = np.zeros(len(texels), dtype=bool)
+    on_usable[in_image] = usable[row, col]
+    return on_usable
 
 
 def _faces_light(texels: TexelTable, light: Light, options: VisibilityOptions) -> Bools:

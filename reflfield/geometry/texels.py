@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from reflfield.errors import GeometryError, InputError
+from reflfield.errors import GeometryError
 from reflfield.geometry.mesh import unit_or_zero
 from reflfield.geometry.uv_atlas import Atlas
 
@@ -23,23 +23,9 @@ _EDGE_SLACK = 1e-7
 # Candidate (triangle, texel) pairs looked at together: bounds the memory at about 100 MB.
 _BLOCK_PAIRS = 1 << 20
 
-
-@dataclass(frozen=True)
-class TexelOptions:
-    """How the texture is cut into texels.
-
-    Parameters
-    ----------
-    gutter : int
-        Ring of texels around each chart that repeats the nearest texel, so that
-        bilinear lookups at the rim of a chart read the chart.
-    """
-
-    gutter: int = 2
-
-    def __post_init__(self) -> None:
-        if self.gutter < 0:
-            raise InputError(f"gutter: expected >= 0 texels, received {self.gutter}")
+# Ring of texels around each chart that repeats the nearest texel, so that bilinear lookups at
+# the rim of a chart read the chart.
+GUTTER = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +103,7 @@ class TexelTable:
         )
 
 
-def texel_table(atlas: Atlas, options: TexelOptions | None = None) -> TexelTable:
+def texel_table(atlas: Atlas) -> TexelTable:
     """Rasterise the charts of an atlas at the centres of its texels.
 
     A texel belongs to the triangle that holds its centre (the first one where
@@ -126,7 +112,6 @@ def texel_table(atlas: Atlas, options: TexelOptions | None = None) -> TexelTable
     Parameters
     ----------
     atlas : Atlas
-    options : TexelOptions, optional
 
     Returns
     -------
@@ -151,7 +136,6 @@ def texel_table(atlas: Atlas, options: TexelOptions | None = None) -> TexelTable
            [0., 1., 0.],
            [0., 0., 1.]], dtype=float32)
     """
-    options = options or TexelOptions()
     pixel_number, face, weights = _covered_texels(atlas)
     if not len(face):
         raise GeometryError(
@@ -176,7 +160,7 @@ def texel_table(atlas: Atlas, options: TexelOptions | None = None) -> TexelTable
         chart=atlas.chart[face],
         mirrored=atlas.mirrored,
         face_normal=atlas.mesh.face_normals[face].astype(np.float32),
-        texel_of_pixel=_nearest_texel(pixel_number, shape, options.gutter),
+        texel_of_pixel=_nearest_texel(pixel_number, shape),
     )
 
 
@@ -289,11 +273,11 @@ def _texel_coordinates(atlas: Atlas) -> tuple[Array, Array]:
 
 
 def _nearest_texel(
-    pixel_number: NDArray[np.int64], shape: tuple[int, int], gutter: int
+    pixel_number: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int32]:
     """Texel numbers in texture space, the gutter filled with the nearest."""
     texel = np.full(shape[0] * shape[1], -1, dtype=np.int32)
     texel[pixel_number] = np.arange(len(pixel_number), dtype=np.int32)
     texel = texel.reshape(shape)
     distance, (row, col) = ndimage.distance_transform_edt(texel < 0, return_indices=True)
-    return np.where(distance <= gutter + 0.5, texel[row, col], -1).astype(np.int32)
+    return np.where(distance <= GUTTER + 0.5, texel[row, col], -1).astype(np.int32)

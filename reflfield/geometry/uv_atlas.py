@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -176,10 +175,6 @@ _COLUMNS = {
 }
 
 
-class AtlasWarning(UserWarning):
-    """The atlas was made by the simpler method."""
-
-
 class UnwrappingError(ReflfieldError):
     """xatlas cannot unwrap a mesh, on no machine: simpler charts can."""
 
@@ -199,32 +194,6 @@ class BuiltAtlas:
     atlas: Atlas
     method: str
     reason: str = ""
-
-
-def build_atlas(mesh: Mesh, options: AtlasOptions | None = None) -> Atlas:
-    """Cut a mesh into charts and pack them into a square texture.
-
-    As `built_atlas`; where the charts are not those asked for, an `AtlasWarning` says why.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    options : AtlasOptions, optional
-
-    Returns
-    -------
-    Atlas
-        Faces in the order of `mesh`; smooth normals carried over from it.
-
-    Raises
-    ------
-    GeometryError
-        As `built_atlas`.
-    """
-    built = built_atlas(mesh, options)
-    if built.reason:
-        warnings.warn(fallback_words(built.reason), AtlasWarning, stacklevel=2)
-    return built.atlas
 
 
 def fallback_words(reason: str) -> str:

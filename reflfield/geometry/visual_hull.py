@@ -401,17 +401,6 @@ def _suspicious(views: Sequence[View], carved: _Carved, fit: _Agreement) -> bool
     return False
 
 
-def silhouette_overlap(
-    mesh: Mesh, cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]
-) -> Array:
-    """Intersection over union of a mesh's silhouettes and given ones, (n_views,) float64.
-
-    Pixels count as covered from one half on. Large images are compared on every k-th
-    pixel of every k-th row, so that about 256 remain along the longer side.
-    """
-    return _agreement(mesh, cameras, silhouettes).overlap
-
-
 def _agreement(
     mesh: Mesh, cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]
 ) -> _Agreement:

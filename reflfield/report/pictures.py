@@ -381,30 +381,6 @@ def enlarged(picture: NDArray[Any], factor: int) -> NDArray[Any]:
     return np.repeat(np.repeat(picture, factor, axis=0), factor, axis=1)
 
 
-def row_of(pictures: Sequence[Encoded], gap: int = 4, colour: Colour = NOTHING) -> Encoded:
-    """Pictures side by side, top-aligned.
-
-    Parameters
-    ----------
-    pictures : sequence of (h, w, 3) uint8
-        At least one; heights may differ.
-    gap : int
-        Pixels between neighbours.
-    colour : tuple of three int
-        Of the gaps.
-
-    Returns
-    -------
-    (h, w, 3) uint8
-
-    Examples
-    --------
-    >>> row_of([np.zeros((2, 3, 3), np.uint8), np.zeros((4, 1, 3), np.uint8)], gap=1).shape
-    (4, 5, 3)
-    """
-    return contact_sheet(pictures, n_columns=max(1, len(pictures)), gap=gap, colour=colour)
-
-
 def contact_sheet(
     pictures: Sequence[Encoded],
     n_columns: int | None = None,

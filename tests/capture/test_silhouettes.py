@@ -6,7 +6,7 @@ import pytest
 
 from reflfield.capture.encoding import decode_srgb
 from reflfield.capture.readers import open_capture
-from reflfield.capture.segmentation import SilhouetteOptions, silhouette_from_photographs
+from reflfield.capture.segmentation import silhouette_from_photographs
 from reflfield.errors import CaptureError, InputError
 
 SIZE = 160
@@ -134,13 +134,6 @@ class TestRefused:
         pair = [np.zeros((4, 5, 3), np.float32), np.zeros((5, 4, 3), np.float32)]
         with pytest.raises(InputError, match="one size"):
             silhouette_from_photographs(pair)
-
-
-def test_options_are_obeyed():
-    ring = disc() - disc(radius=20)
-    options = SilhouetteOptions(smallest_hole=0.9)
-    found = silhouette_from_photographs([composed(ring, 0.6, 0.0)], options)
-    assert overlap(found, disc()) > 0.98
 
 
 def test_simulated_dome_photographs(shared_data):

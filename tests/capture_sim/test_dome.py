@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from capture_sim.dome import (
     bonn151,
     fibonacci,
-    held_out,
     look_at,
     make_cameras,
     make_lights,
@@ -66,20 +65,6 @@ def test_fibonacci_is_even():
     spacing = np.arccos(cosine.max(axis=1))
     assert spacing.min() > 0.7 * np.sqrt(4 * np.pi / 500)
     assert fibonacci(50, np.radians(60))[:, 2].min() > 0.5
-
-
-def test_held_out_directions_are_new_and_repeatable():
-    rig = fibonacci(100, np.radians(70))
-    new = held_out(8, 5, rig)
-    np.testing.assert_array_equal(new, held_out(8, 5, rig))
-    assert not np.array_equal(new, held_out(8, 6, rig))
-    distance = np.degrees(np.arccos((new @ rig.T).max(axis=1)))
-    spacing = np.degrees(np.arccos((rig @ rig.T - 3 * np.eye(100)).max(axis=1)))
-    assert distance.min() > 0.3 * np.median(spacing)
-    assert new[:, 2].min() >= rig[:, 2].min() - 1e-12
-    apart = new @ new.T - 3 * np.eye(8)
-    assert np.degrees(np.arccos(apart.max())) > 10.0
-    assert held_out(3, 1, np.array([[0.0, 0.0, 1.0]])).shape == (3, 3)
 
 
 # -------------------------------------------------------------------------- cameras

@@ -175,10 +175,3 @@ def test_noise_of_photographs_is_independent_and_repeatable():
         other = sensor_noise.apply(radiance, noisy, frame)
         correlation = np.corrcoef(first.ravel(), other.ravel())[0, 1]
         assert abs(correlation) < 4 / np.sqrt(first.size)  # 4 sigma
-
-
-def test_inner_edges_count_as_outlines():
-    face = np.array([[1, 2, 3, 4]] * 2)
-    distance = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.5, 1.5]], np.float32)
-    crossed = antialiasing.crossed_by_outline(face, distance, step=0.1)
-    assert crossed.tolist() == [False, True]

@@ -1,4 +1,4 @@
-"""Cameras on a sphere and exact silhouettes of balls, for the tests of this room."""
+"""Cameras on a sphere and exact silhouettes of balls, for the tests of this package."""
 
 import numpy as np
 
@@ -43,8 +43,9 @@ def cameras(n, size=96, kind="opencv", centre=(0, 0, 0), scale=1.0, zoom=1.5):
 
 def ball_silhouette(camera, centre=(0, 0, 0), radius=1.0, samples=4):
     """Coverage of a ball, by rays through `samples`^2 points of each pixel."""
-    fine = camera.resized(camera.width * samples, camera.height * samples)
-    origins, ways = fine.rays(fine.pixel_centres())
+    v, u = np.mgrid[: camera.height * samples, : camera.width * samples]
+    points = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=1) / samples
+    origins, ways = camera.rays(points)
     offset = np.asarray(centre) - origins
     along = (offset * ways).sum(axis=1)
     hit = (offset * offset).sum(axis=1) - along * along < radius * radius

@@ -11,14 +11,13 @@ from reflfield.errors import GeometryError, InputError
 from reflfield.geometry import uv_atlas as atlas_module
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.plane import image_plane
-from reflfield.geometry.texels import TexelOptions, frames, texel_table, texture_axes
+from reflfield.geometry.texels import frames, texel_table, texture_axes
 from reflfield.geometry.uv_atlas import (
     Atlas,
     AtlasOptions,
-    AtlasWarning,
     UnwrappingError,
-    build_atlas,
     built_atlas,
+    fallback_words,
 )
 
 
@@ -29,7 +28,9 @@ def torus(scale=1.0, origin=0.0):
 
 @pytest.fixture(scope="module", params=["xatlas", "boxes"])
 def torus_atlas(request):
-    return torus(), build_atlas(torus(), AtlasOptions(resolution=128, method=request.param))
+    return torus(), built_atlas(
+        torus(), AtlasOptions(resolution=128, method=request.param)
+    ).atlas
 
 
 def quad(mirrored=False, height=4, width=8):
@@ -100,14 +101,14 @@ def test_tangents_run_along_u_and_binormals_along_v_unless_mirrored(torus_atlas)
 
 def test_the_gutter_repeats_the_nearest_texel(torus_atlas):
     _, atlas = torus_atlas
-    texels = texel_table(atlas, TexelOptions(gutter=2))
+    texels = texel_table(atlas)
     np.testing.assert_array_equal(
         texels.texel_of_pixel[tuple(texels.pixel.T)], range(len(texels))
     )
     row, col = np.nonzero(texels.texel_of_pixel >= 0)
     nearest = texels.pixel[texels.texel_of_pixel[row, col]]
     assert np.hypot(*(nearest - np.stack([row, col], axis=1)).T).max() <= 2.5
-    assert (texel_table(atlas, TexelOptions(gutter=0)).texel_of_pixel >= 0).sum() == len(texels)
+    assert len(row) > len(texels)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -139,7 +140,7 @@ def test_degenerate_triangles_have_no_texels_and_break_nothing():
     mesh = torus()
     extra = np.array([[0, 0, 1], [2, 2, 2]])
     mesh = Mesh(mesh.vertices, np.concatenate([mesh.faces, extra]))
-    atlas = build_atlas(mesh, AtlasOptions(resolution=64))
+    atlas = built_atlas(mesh, AtlasOptions(resolution=64)).atlas
     np.testing.assert_array_equal(atlas.positions[atlas.faces], mesh.corners)
     assert texel_table(atlas).face.max() < len(mesh.faces) - 2
 
@@ -149,7 +150,7 @@ def test_degenerate_triangles_have_no_texels_and_break_nothing():
 @pytest.mark.parametrize(("scale", "origin"), [(1e-3, 0.0), (1.0, 1e3)])
 def test_a_single_triangle_anywhere_gets_a_chart(method, scale, origin):
     mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.5]]) * scale + origin, [[0, 1, 2]])
-    atlas = build_atlas(mesh, AtlasOptions(resolution=32, method=method))
+    atlas = built_atlas(mesh, AtlasOptions(resolution=32, method=method)).atlas
     texels = texel_table(atlas)
     assert atlas.n_charts == 1
     assert texels.area.sum() == pytest.approx(mesh.area, rel=0.2)  # a coarse raster of one face
@@ -187,8 +188,7 @@ def test_a_worker_that_crashes_leaves_box_charts_and_says_so(monkeypatch):
     built = built_atlas(torus(), AtlasOptions(resolution=64))
     assert (built.method, built.reason) == ("boxes", "xatlas crashed (SIGSEGV)")
     assert texels_covered_more_than_once(built.atlas) == 0
-    with pytest.warns(AtlasWarning, match="crashed .SIGSEGV.; the atlas is made of box charts"):
-        build_atlas(torus(), AtlasOptions(resolution=64))
+    assert "the atlas is made of box charts" in fallback_words(built.reason)
 
 
 @pytest.mark.parametrize(
@@ -247,9 +247,9 @@ def test_the_worker_is_refused_more_memory_than_it_may_take():
 def test_the_worker_is_found_from_any_folder(tmp_path):
     script = (
         "import numpy as np\n"
-        "from reflfield.geometry.uv_atlas import build_atlas\n"
+        "from reflfield.geometry.uv_atlas import built_atlas\n"
         "from reflfield.geometry.mesh import Mesh\n"
-        "atlas = build_atlas(Mesh([[0,0,0],[1,0,0],[0,1,0]], [[0,1,2]]))\n"
+        "atlas = built_atlas(Mesh([[0,0,0],[1,0,0],[0,1,0]], [[0,1,2]])).atlas\n"
         "raise SystemExit(0 if atlas.n_charts == 1 else 1)\n"
     )
     command = [sys.executable, "-W", "error::UserWarning", "-c", script]
@@ -260,7 +260,7 @@ def test_bad_input_is_refused():
     with pytest.raises(InputError, match=r"uv: expected values in \[0, 1\]"):
         Atlas(np.eye(3), [[0, 1, 2]], np.full((3, 2), 1.5), [0], np.eye(3), 4, 4)
     with pytest.raises(GeometryError, match="area"):
-        build_atlas(Mesh(np.zeros((3, 3)), [[0, 1, 2]]))
+        built_atlas(Mesh(np.zeros((3, 3)), [[0, 1, 2]]))
     with pytest.raises(InputError, match="method"):
         AtlasOptions(method="magic")
     flat = Atlas(np.eye(3), [[0, 1, 2]], np.zeros((3, 2)), [0], np.eye(3), 4, 4)

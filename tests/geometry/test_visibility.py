@@ -10,14 +10,12 @@ from reflfield.geometry.occlusion import (
     VisibilityOptions,
     check_light_outside,
     depth_edges,
-    light_inside,
     light_visibility,
-    shadow_edge,
     view_visibility,
 )
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import texel_table
-from reflfield.geometry.uv_atlas import Atlas, AtlasOptions, build_atlas
+from reflfield.geometry.uv_atlas import Atlas, AtlasOptions, built_atlas
 
 UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
 
@@ -110,18 +108,6 @@ def test_far_and_unknown_lights():
     assert light_visibility(texels, scene, Light("l", "unknown")).all()
 
 
-def test_shadow_edges_are_a_band_around_the_boundary():
-    scene, texels = floor_under_a_square()
-    lamp = Light("l", "point", position=[0, 0, 3.0])
-    band = VisibilityOptions(shadow_band=1.5)
-    on_edge = shadow_edge(texels, scene, lamp, band)
-    distance = np.abs(shadow_of(3.0, texels))
-    radius = 1.5 * texels.spacing
-    assert on_edge[distance < 0.5 * radius].all()
-    assert not on_edge[distance > 1.6 * radius].any()
-    assert not shadow_edge(texels, scene, Light("l", "unknown")).any()
-
-
 @pytest.mark.parametrize("kind", ["opencv", "orthographic"])
 def test_cameras_see_the_floor_beside_the_occluder(kind):
     scene, texels = floor_under_a_square()
@@ -161,7 +147,7 @@ def test_grazing_views_bad_pixels_and_texels_outside_the_frame_are_rejected():
 
 def test_the_back_is_not_seen_and_blocks_do_not_matter():
     mesh = two_balls()
-    texels = texel_table(build_atlas(mesh, AtlasOptions(resolution=64, method="boxes")))
+    texels = texel_table(built_atlas(mesh, AtlasOptions(resolution=64, method="boxes")).atlas)
     scene = RayScene(mesh)
     camera = top_camera()
     seen = view_visibility(texels, scene, camera)
@@ -176,7 +162,7 @@ def test_the_back_is_not_seen_and_blocks_do_not_matter():
 def test_a_surface_does_not_shadow_itself():
     ball = trimesh.creation.icosphere(subdivisions=4)
     mesh = Mesh(ball.vertices, ball.faces)
-    texels = texel_table(build_atlas(mesh, AtlasOptions(resolution=64, method="boxes")))
+    texels = texel_table(built_atlas(mesh, AtlasOptions(resolution=64, method="boxes")).atlas)
     lamp = Light("l", "directional", direction=[1, 2, 3])
     lit = light_visibility(texels, RayScene(mesh), lamp)
     cosine = texels.normal @ lamp.direction
@@ -204,11 +190,10 @@ def test_shadows_do_not_depend_on_place_and_size(scale, origin):
 
 def test_a_light_inside_the_object_is_refused_by_name():
     mesh = two_balls()
-    assert light_inside(mesh, [0.5, 0, 0])
-    assert light_inside(mesh, [0, 0, 1.8])
-    assert not light_inside(mesh, [0, 0, 1.25])
-    assert not light_inside(mesh, [1e6, 0, 0])
-    assert not light_inside(Mesh(mesh.vertices, mesh.faces[1:]), [0.5, 0, 0])  # not closed
+    positions = np.array([[0.5, 0, 0], [0, 0, 1.8], [0, 0, 1.25], [1e6, 0, 0]])
+    assert RayScene(mesh).inside(positions).tolist() == [True, True, False, False]
+    open_mesh = Mesh(mesh.vertices, mesh.faces[1:])
+    assert not RayScene(open_mesh).inside(positions[:1]).any()
     with pytest.raises(InputError, match=r"light 'l042'.*inside its hull"):
         check_light_outside(RayScene(mesh), Light("l042", "point", position=[0.5, 0, 0]))
     check_light_outside(RayScene(mesh), Light("l", "directional"))

@@ -375,7 +375,8 @@ def test_window_holds_all_of_the_mesh():
     renderer = Renderer(field, ONE_THREAD)
     first_row, end_row, first_column, end_column = pixel_window(camera, renderer.surface.mesh)
     assert 0 < first_row < end_row < 64
-    origins, directions = camera.rays(camera.pixel_centres())
+    centres = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5), axis=-1)
+    origins, directions = camera.rays(centres.reshape(-1, 2))
     hit = np.zeros(64 * 64, bool)
     hit[renderer.surface.first_hits(origins, directions).ray] = True
     rows, columns = np.nonzero(hit.reshape(64, 64))
