@@ -14,6 +14,7 @@ import typer
 
 from reflfield import __version__
 from reflfield.errors import InputError, ReflfieldError
+from reflfield.flags import with_flags
 from reflfield.util.interrupts import ending_on_signals
 from reflfield.util.terminal import say, say_error, showing_progress
 
@@ -79,7 +80,7 @@ def main() -> None:
         with ending_on_signals():
             app()
     except ReflfieldError as error:
-        fail(str(error), error)
+        fail(with_flags(str(error)), error)
     except OSError as error:  # a folder that cannot be written, a full disk
         fail(system_words(error), error)
     finally:
@@ -100,7 +101,7 @@ class Notes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Say one note."""
-        say_error(f"reflfield: note: {record.getMessage()}")
+        say_error(f"reflfield: note: {with_flags(record.getMessage())}")
 
 
 def fail(message: str, error: Exception) -> NoReturn:
@@ -402,7 +403,7 @@ def size_settings(size: str, psnr: float | None) -> list[str]:
 
     settings = []
     if size:
-        settings.append(f"compression.size={parse_bytes(size, '--size')}")
+        settings.append(f"compression.size={parse_bytes(size, 'size')}")
         if settings[0].endswith("=0") or "-" in size:
             raise InputError(f"--size: expected more than no bytes, received {size!r}")
     if psnr is not None:

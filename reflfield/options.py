@@ -81,10 +81,12 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         name, equals, text = setting.partition("=")
         path = [part.strip() for part in name.split(".")]
         if not (equals and all(path)):
-            raise InputError(f"--set: expected stage.option=value, received {_shown(setting)}")
+            raise InputError(
+                f"settings: expected stage.option=value, received {_shown(setting)}"
+            )
         if len(path) > MOST_PARTS:
             raise InputError(
-                f"--set: expected stage.option=value, received a name of {len(path)} parts"
+                f"settings: expected stage.option=value, received a name of {len(path)} parts"
             )
         table: Any = _toml_value(text.strip())
         for part in reversed(path):
@@ -275,12 +277,10 @@ class Resources:
 
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= MOST_WORKERS:
-            raise InputError(
-                f"--workers: expected 1 to {MOST_WORKERS}, received {self.workers}"
-            )
+            raise InputError(f"workers: expected 1 to {MOST_WORKERS}, received {self.workers}")
         if self.max_memory < LEAST_MEMORY:
             raise InputError(
-                f"--max-memory: expected at least {gigabytes(LEAST_MEMORY)}, received "
+                f"max_memory: expected at least {gigabytes(LEAST_MEMORY)}, received "
                 f"{gigabytes(self.max_memory)}: the libraries alone take half of that"
             )
 
@@ -311,7 +311,7 @@ def gigabytes(size: float) -> str:
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
-def parse_bytes(text: str, option: str = "--max-memory") -> int:
+def parse_bytes(text: str, name: str = "max_memory") -> int:
     """Bytes of a size such as ``4GB`` or ``512MB`` (powers of 1024).
 
     Raises
@@ -330,7 +330,7 @@ def parse_bytes(text: str, option: str = "--max-memory") -> int:
         return int(float(digits) * _UNITS[upper[len(digits) :]])
     except (ValueError, KeyError, OverflowError):
         raise InputError(
-            f"{option}: expected a number with MB or GB, such as 4GB, received {_shown(text)}"
+            f"{name}: expected a number with MB or GB, such as 4GB, received {_shown(text)}"
         ) from None
 
 
@@ -361,7 +361,7 @@ class HoldOut:
     >>> HoldOut(views=2, photographs=3)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
-    reflfield.errors.InputError: --hold-out: expected ... received views=2,photographs=3
+    reflfield.errors.InputError: hold_out: expected ... received views=2,photographs=3
     """
 
     views: int = 0
@@ -374,11 +374,11 @@ class HoldOut:
             count = getattr(self, name)
             whole = isinstance(count, Integral) and not isinstance(count, bool)
             if not whole or count < 0:
-                raise InputError(f"--hold-out {name}: expected a number >= 0, received {count}")
+                raise InputError(f"hold_out: {name}: expected a number >= 0, received {count}")
         by_pairs = self.views > 0 or self.lights > 0
         if by_pairs + (self.photographs > 0) + self.test > 1:
             raise InputError(
-                "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
+                "hold_out: expected views=K,lights=K, or photographs=K, or test, received "
                 f"{self}"
             )
 
@@ -412,7 +412,7 @@ def parse_hold_out(text: str) -> HoldOut:
             count = -1
         if count < 0 or name in counts:
             raise InputError(
-                "--hold-out: expected views=K,lights=K, or photographs=K, or test, received "
+                "hold_out: expected views=K,lights=K, or photographs=K, or test, received "
                 f"{_shown(text)}"
             )
         counts[name] = count

@@ -27,6 +27,7 @@ PACKAGES = (
     "report",
     "pipeline",
     "demo",
+    "flags",
     "cli",
     "__main__",
 )

@@ -178,6 +178,6 @@ def _doubt(
     what = "pages" if header.kind == "tiff" else "layers or parts"
     expected = f"the layer {wanted!r}" if wanted else "one that is the picture without doubt"
     return CaptureError(
-        f"{path}: expected {expected}, received the {what} {shown}; say which one with --layer "
-        'NAME or "layer" in capture.json'
+        f"{path}: expected {expected}, received the {what} {shown}; say which one with "
+        '`layer="NAME"` or "layer" in capture.json'
     )

@@ -160,8 +160,8 @@ class NamedFiles:
         if not self.follow_links and not target.is_relative_to(self._resolved_root):
             raise CaptureError(
                 f"{self.description}: {name!r} is reached through a symbolic link that leads "
-                f"out of the folder, to {target}; allow it with --follow-links "
-                "(follow_links=True), or put the file itself there"
+                f"out of the folder, to {target}; allow it with "
+                "`follow_links=True`, or put the file itself there"
             )
         return path
 

@@ -42,8 +42,8 @@ def check_code_range(capture: Capture) -> None:
         raise CaptureError(
             f"{capture.photographs[0].path}: expected 16-bit photographs that use their range, "
             f"received codes up to {largest} in all that were looked into "
-            f"({len(looked_into)}), as of a sensor of 12 bits; say --encoding linear if they "
-            "are a sensor's values, --encoding srgb if they are encoded and so dark"
+            f"({len(looked_into)}), as of a sensor of 12 bits; say `encoding='linear'` if "
+            "they are a sensor's values, `encoding='srgb'` if they are encoded and so dark"
         )
 
 

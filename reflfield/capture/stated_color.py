@@ -84,7 +84,7 @@ def stated_space(
     except InputError as error:
         raise CaptureError(
             f"{path}: expected colour that is understood, received {error}; convert the file "
-            "to sRGB or linear Rec.709, or say how it is encoded (--encoding), which replaces "
+            "to sRGB or linear Rec.709, or say how it is encoded (`encoding`), which replaces "
             "what the file says"
         ) from error
 

@@ -149,7 +149,7 @@ def read_transforms(
     elif test or beside is not None:
         reading.notes.append(
             f"{description}: the test split ({beside.name if beside else len(test)}) is not "
-            "used; --hold-out test compares with it"
+            "used; `hold_out=HoldOut(test=True)` compares with it"
         )
     check_counts(str(description), 0, 0, len(used))
     check_lights(used)

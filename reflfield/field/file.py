@@ -157,8 +157,8 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
     if total > max_bytes:
         raise FieldFileError(
             f"{path}: expected arrays of at most {max_bytes} bytes, the header declares "
-            f"some that take {total:.0f}; raise --max-memory (in Python max_bytes) if the "
-            "file is to be trusted"
+            f"some that take {total:.0f}; raise `max_memory` if the file is to "
+            "be trusted"
         )
     with _naming(path):
         return _field(header, StoredArrays(path, declared))

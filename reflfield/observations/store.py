@@ -210,14 +210,14 @@ def checked_read(
     except ValueError as error:
         raise InputError(
             f"{location}: expected chunks that agree with their checksums, found one that "
-            f"does not ({error}); compute the stage again with --from"
+            f"does not ({error}); compute the stage again with `from_stage='observations'`"
         ) from error
     found = np.asarray(found)
     first = (slice(None), *(slice(None, None, step) for step in array.chunks[1:]))
     if np.isneginf(found[first]).any():
         raise InputError(
             f"{location}: expected all chunks, found some missing; compute the stage again "
-            "with --from"
+            "with `from_stage='observations'`"
         )
     return found
 
@@ -261,16 +261,16 @@ def check_place(store: str, *, capture: Path, out: Path) -> None:
     if "://" in store and not store.startswith("file://"):
         if not store.partition("://")[2].strip("/ "):
             raise InputError(
-                f"--store: expected a place, such as {store}/name, received {store}"
+                f"store: expected a place, such as {store}/name, received {store}"
             )
         return
     text = store.removeprefix("file://")
     if not text.strip():
-        raise InputError(f"--store: expected a folder or a URL, received {store!r}")
+        raise InputError(f"store: expected a folder or a URL, received {store!r}")
     reason = _other_use(Path(text).resolve(), capture.resolve(), out.resolve())
     if reason:
         raise InputError(
-            f"--store: expected a new or empty folder, or one that holds samples alone, "
+            f"store: expected a new or empty folder, or one that holds samples alone, "
             f"received {text}, {reason}; name another, such as {Path(text) / 'samples'}"
         )
 
@@ -394,7 +394,7 @@ def open_samples(location: Location, mode: Literal["r", "r+"] = "r+") -> zarr.Ar
     except FileNotFoundError as error:
         raise InputError(
             f"{location}: expected samples, found none; compute the stage again with "
-            "--from observations"
+            "`from_stage='observations'`"
         ) from error
 
 
@@ -409,7 +409,7 @@ def _opened_array(location: Location, mode: Literal["r", "r+"]) -> zarr.Array:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{location}: expected samples, found a damaged description of them ({error}); "
-            "remove the folder, then compute the stage again with --from observations"
+            "remove the folder, then compute the stage again with `from_stage='observations'`"
         ) from error
 
 

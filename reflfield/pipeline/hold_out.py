@@ -97,8 +97,8 @@ def split_of(capture: Capture, hold_out: HoldOut) -> Split:
     removed, compared, kind = _removed(capture, hold_out, (view, light), (views, lights))
     if removed.all():
         raise InputError(
-            f"--hold-out {hold_out}: expected photographs left to make the field of, received "
-            f"none: all {len(view)} are held out; hold out fewer, or photographs=K"
+            f"hold_out: expected photographs left to make the field of, received none: "
+            f"{hold_out} holds out all {len(view)}; hold out fewer, or photographs=K"
         )
     return Split(
         views,
@@ -140,7 +140,7 @@ def _test_split(capture: Capture) -> Bools:
     test[capture.test_split] = True
     if not test.any():
         raise InputError(
-            f"--hold-out test: expected a capture with a test split (transforms_test.json), "
+            f"hold_out: test: expected a capture with a test split (transforms_test.json), "
             f"{capture.description or capture.root} has none; use photographs=K, or "
             "views=K,lights=K"
         )
@@ -194,7 +194,7 @@ def spread_photographs(views: Indices, lights: Indices, count: int) -> Bools:
     """
     if count >= len(views):
         raise InputError(
-            f"--hold-out: expected fewer than {_all_of(len(views), 'photographs')}, "
+            f"hold_out: expected fewer than {_all_of(len(views), 'photographs')}, "
             f"received {count}"
         )
     ranks = [np.unique(ids, return_inverse=True) for ids in (views, lights)]
@@ -229,7 +229,7 @@ def evenly_spread(count: int, total: int, what: str) -> Indices:
     """
     if count and count >= total:
         raise InputError(
-            f"--hold-out: expected fewer than {_all_of(total, what)}, received {count}"
+            f"hold_out: expected fewer than {_all_of(total, what)}, received {count}"
         )
     return ((np.arange(count) + 0.5) * total / max(count, 1)).astype(np.intp)
 

@@ -114,7 +114,7 @@ def check_memory(job: Job) -> None:
     least, given = least_memory(job), job.resources.max_memory
     if least > given:
         raise InputError(
-            f"--max-memory: expected at least {gigabytes(least + (1 << 26))} for "
+            f"max_memory: expected at least {gigabytes(least + (1 << 26))} for "
             f"{job.training.n_views} views, {job.training.n_lights} lights and up to "
             f"{most_texels(job)} texels, received {gigabytes(given)}; raise it, or lower "
             "texture.largest"
@@ -213,7 +213,7 @@ def check_picture_memory(
         frames = f" and {kept_pixels} in all" if kept_pixels else ""
         received = gigabytes(resources.max_memory)
         raise InputError(
-            f"--max-memory: expected at least {gigabytes(least + (1 << 26))} for pictures of "
+            f"max_memory: expected at least {gigabytes(least + (1 << 26))} for pictures of "
             f"{pixels} pixels{frames}, received {received}; raise it, or make the pictures, "
             "their number or the map smaller"
         )

@@ -65,8 +65,8 @@ def check_choices(job: Job) -> None:
     if len(_visibilities(job)) > 1 and not job.held_frames.photographs:
         raise InputError(
             f"{VISIBILITY}: 'auto' expected frames to compare on, received none; hold some "
-            "out with --hold-out views=K,lights=K or photographs=K, or set it to 'factored' "
-            "or 'kept'"
+            "out with `hold_out=HoldOut(views=K, lights=K)` or "
+            "`hold_out=HoldOut(photographs=K)`, or set it to 'factored' or 'kept'"
         )
 
 

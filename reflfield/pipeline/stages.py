@@ -346,11 +346,11 @@ def run(
     GeometryError
         If the silhouettes do not determine a surface.
     """
-    wanted = STAGES[: _number("--until", last) + 1]
-    redo = frozenset(STAGES[_number("--from", first) :]) if first else frozenset()
+    wanted = STAGES[: _number("until", last) + 1]
+    redo = frozenset(STAGES[_number("from_stage", first) :]) if first else frozenset()
     if redo and redo.isdisjoint(wanted):
         raise InputError(
-            f"--from, --until: expected the first stage not after the last, received {first} "
+            f"from_stage, until: expected the first stage not after the last, received {first} "
             f"after {last}"
         )
     job = Job(
@@ -407,7 +407,7 @@ def settled(job: Job) -> Job:
     return model_selection.decided(job)
 
 
-def _number(option: str, name: str) -> int:
+def _number(argument: str, name: str) -> int:
     if name not in STAGES:
-        raise InputError(f"{option}: expected one of {', '.join(STAGES)}, received {name!r}")
+        raise InputError(f"{argument}: expected one of {', '.join(STAGES)}, received {name!r}")
     return STAGES.index(name)

@@ -58,7 +58,8 @@ class TurntableLighting:
     def __post_init__(self) -> None:
         if (self.environment is None) == (self.light is None):
             raise InputError(
-                "relight --orbit: expected either --environment MAP or --light X,Y,Z"
+                "environment, light: expected one of the two for a turntable, received "
+                f"{'both' if self.light else 'neither'}"
             )
 
     @property
@@ -72,27 +73,27 @@ class TurntableLighting:
     def opened(self, up: NDArray[np.float64]) -> Light | EnvironmentMap:
         """Light, or map with its zenith turned to where it is stated or else to `up`."""
         if self.environment is None:
-            towards = direction_of("--light", str(self.light))
+            towards = direction_of("light", str(self.light))
             power = np.full(3, np.pi)
             return Light("turntable", "directional", direction=towards, intensity=power)
         zenith = up
         if self.environment_up is not None:
-            zenith = direction_of("--environment-up", self.environment_up, axes=True)
+            zenith = direction_of("environment_up", self.environment_up, axes=True)
         sky = EnvironmentMap.open(self.environment, self.convention or "openexr")
         return sky.turned_to(zenith, self.environment_rotation or 0.0)
 
 
-def direction_of(option: str, text: str, *, axes: bool = False) -> NDArray[np.float64]:
+def direction_of(name: str, text: str, *, axes: bool = False) -> NDArray[np.float64]:
     """Unit direction of ``x,y,z``, or of an axis such as ``-Y`` where `axes` allows it.
 
     Raises
     ------
     InputError
-        If the text has another form; the message names the option.
+        If the text has another form; the message names the argument.
 
     Examples
     --------
-    >>> direction_of("--environment-up", "-z", axes=True)
+    >>> direction_of("environment_up", "-z", axes=True)
     array([ 0.,  0., -1.])
     """
     word = text.strip().upper()
@@ -100,11 +101,11 @@ def direction_of(option: str, text: str, *, axes: bool = False) -> NDArray[np.fl
         sign = -1.0 if word.startswith("-") else 1.0
         return sign * np.array(AXES[word[-1]]) + 0.0
     try:
-        return unit_direction(option, [float(part) for part in text.split(",")])
+        return unit_direction(name, [float(part) for part in text.split(",")])
     except ValueError:
         words = "X, Y, Z, -X, -Y, -Z or x,y,z" if axes else "X,Y,Z"
         raise InputError(
-            f"{option}: expected {words} of finite numbers, not all zero, received {text!r}"
+            f"{name}: expected {words} of finite numbers, not all zero, received {text!r}"
         ) from None
 
 

@@ -125,7 +125,7 @@ class ClusterWork:
             )
         except (OSError, ValueError) as error:
             raise InputError(
-                f"--scheduler: expected a dask scheduler at {self._address}, found none "
+                f"scheduler: expected a dask scheduler at {self._address}, found none "
                 f"({error}); start one with `dask scheduler`"
             ) from error
         try:
@@ -147,7 +147,7 @@ class ClusterWork:
 
     def _lost(self, error: BaseException | None) -> NoReturn:
         raise InputError(
-            f"--scheduler: expected the scheduler at {self._address} to stay, lost it; start "
+            f"scheduler: expected the scheduler at {self._address} to stay, lost it; start "
             f"it and its workers, then {GO_ON}"
         ) from error
 
@@ -221,7 +221,7 @@ class ClusterWork:
 
 def _deadly(address: str) -> NoReturn:
     raise InputError(
-        f"--scheduler: expected workers that live through a block, lost {MOST_DEATHS} at the "
+        f"scheduler: expected workers that live through a block, lost {MOST_DEATHS} at the "
         f"same one, the last of them {address}; see its log, give workers more memory "
         f"(`dask worker --memory-limit`), and {GO_ON}"
     )
@@ -259,7 +259,7 @@ class _Workers:
         name = f"waiting for workers of {self._address}"
         if seconds >= WAITING_SECONDS:
             raise InputError(
-                f"--scheduler: expected workers at {self._address}, found none for "
+                f"scheduler: expected workers at {self._address}, found none for "
                 f"{WAITING_SECONDS} s; start some with `dask worker {self._address}`, then "
                 f"{GO_ON}"
             )

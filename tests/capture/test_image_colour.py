@@ -120,7 +120,7 @@ class TestPng:
     )
     def test_refused_with_the_remedy(self, tmp_path, chunk, reason):
         png_with(tmp_path / "a.png", chunk)
-        with pytest.raises(CaptureError, match=rf"a\.png: .*{reason}.*--encoding"):
+        with pytest.raises(CaptureError, match=rf"a\.png: .*{reason}.*`encoding`"):
             read_image(tmp_path / "a.png")
         said = ImageReading(encoding=Encoding("linear"))
         np.testing.assert_allclose(read_image(tmp_path / "a.png", said), SHARES, rtol=1e-6)
@@ -192,7 +192,7 @@ class TestProfiles:
     )  # fmt: skip
     def test_refused_by_name(self, tmp_path, profile, reason):
         self.save(tmp_path / "a.tif", profile)
-        with pytest.raises(CaptureError, match=rf"a\.tif: .*profile.*{reason}.*--encoding"):
+        with pytest.raises(CaptureError, match=rf"a\.tif: .*profile.*{reason}.*`encoding`"):
             read_image(tmp_path / "a.tif")
 
     def test_of_a_silhouette_is_none_of_our_business(self, tmp_path):

@@ -119,7 +119,7 @@ class TestParts:
         plane = np.ones((HEIGHT, WIDTH))
         contents = {name: dict.fromkeys("RGB", plane) for name in ("N", "albedo", "specular")}
         write_parts(tmp_path / "p.exr", contents)
-        with pytest.raises(CaptureError, match=r"p\.exr.*parts N, albedo, specular.*--layer"):
+        with pytest.raises(CaptureError, match=r"p\.exr.*parts N, albedo, specular.*`layer="):
             read_image(tmp_path / "p.exr")
 
 
@@ -139,7 +139,7 @@ class TestPages:
 
     def test_doubt_and_choice(self, tmp_path):
         write_tiff(tmp_path / "t.tif", [self.page(0, 6), self.page(255, 7)])
-        with pytest.raises(CaptureError, match=r"t\.tif.*pages page6, page7.*--layer"):
+        with pytest.raises(CaptureError, match=r"t\.tif.*pages page6, page7.*`layer="):
             read_image(tmp_path / "t.tif")
         for name in ("page7", "1"):
             reading = ImageReading(layer=name)

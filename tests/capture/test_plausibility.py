@@ -45,7 +45,7 @@ class TestCodes:
     def test_linear_codes_of_12_bits_are_no_dark_srgb(self, frozen):
         in_png(frozen, lambda image: 4095 * image)
         with pytest.raises(
-            CaptureError, match=r"\.png: .*codes up to 4095 .*12 bits.*--encoding linear"
+            CaptureError, match=r"\.png: .*codes up to 4095 .*12 bits.*`encoding='linear'`"
         ):
             open_capture(frozen)
         capture = open_capture(frozen, reading=LINEAR)

@@ -385,7 +385,7 @@ class TestFiles:
         (blobs / "f01").write_text(text)
         (snapshot / "transforms.json").symlink_to("../../blobs/f01")
         with pytest.raises(
-            CaptureError, match=r"'a.exr'.*symbolic link.*blobs.*--follow-links"
+            CaptureError, match=r"'a.exr'.*symbolic link.*blobs.*`follow_links=True`"
         ):
             open_capture(snapshot)
         capture = open_capture(snapshot, follow_links=True)

@@ -42,7 +42,7 @@ class TestTwoFiles:
         capture = open_capture(split)
         assert [p.name for p in capture.photographs] == ["r_0", "r_1"]
         assert (capture.n_views, capture.n_lights) == (2, 2)
-        assert "transforms_test.json) is not used; --hold-out test" in caplog.text
+        assert "transforms_test.json) is not used; `hold_out=HoldOut(test=True)`" in caplog.text
 
     def test_the_test_split_comes_after_and_is_marked(self, split):
         capture = open_capture(split, test_split=True)

@@ -74,7 +74,7 @@ class TestDamage:
         data = bytearray(chunk.read_bytes())
         data[len(data) // 2] ^= 4
         chunk.write_bytes(data)
-        with pytest.raises(InputError, match=r"store: expected chunks that agree .* --from"):
+        with pytest.raises(InputError, match=r"chunks that agree .* `from_stage"):
             stored.read(np.array([1500]))
         # Other chunks are as good as ever.
         assert np.array_equal(stored.read(slice(0, 1024)), values[:1024])
@@ -242,7 +242,7 @@ class TestPlace:
         ],
     )
     def test_in_use_is_refused(self, folders, tmp_path, place, reason):
-        with pytest.raises(InputError, match=f"--store: .*{reason}"):
+        with pytest.raises(InputError, match=f"store: .*{reason}"):
             check_place(place.format(tmp_path), **folders)
 
     @pytest.mark.parametrize("place", ["{}/new/deep", "{}/empty", "{}/ours", "{}/out/samples",

@@ -19,7 +19,7 @@ from reflfield.util.progress import listening
 def test_address_without_a_scheduler(tmp_path, monkeypatch):
     monkeypatch.setattr("reflfield.util.dask_cluster.CONNECTING_SECONDS", 0.3)
     blocks = Blocks(Scheduler(1, "tcp://127.0.0.1:9"), tmp_path)
-    with pytest.raises(InputError, match="--scheduler: expected a dask scheduler at tcp"):
+    with pytest.raises(InputError, match="scheduler: expected a dask scheduler at tcp"):
         blocks.map("blocks", len, None, [[]])
 
 

@@ -188,7 +188,7 @@ class TestRefused:
         "values", [{"views": -1}, {"photographs": 1.5}, {"lights": True}, {"views": "2"}]
     )
     def test_counts_that_are_none(self, values):
-        with pytest.raises(InputError, match=f"--hold-out {next(iter(values))}"):
+        with pytest.raises(InputError, match=f"hold_out: {next(iter(values))}"):
             HoldOut(**values)
 
     @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ class TestCeiling:
         larger = PipelineOptions(texture=TextureOptions(largest=4096))
         tight = replace(job, options=larger, resources=Resources(1, GB))
         with pytest.raises(
-            InputError, match=r"--max-memory: expected at least \d.\d GB .* 9 v"
+            InputError, match=r"max_memory: expected at least \d.\d GB .* 9 v"
         ):
             check_memory(tight)
 

@@ -71,8 +71,8 @@ def rate_distortion_section(points: Sequence[RatePoint], note: str = "") -> Sect
     )
     return Section(
         "Quality against size",
-        "The field at several quantisation steps, of which compression.coarseness, --size or "
-        "--psnr chooses one.",
+        "The field at several quantisation steps, of which compression.coarseness, "
+        "compression.size or compression.psnr selects one.",
         (figure, _table(points), *((Note(note),) if note else ())),
     )
 

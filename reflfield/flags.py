@@ -1,0 +1,75 @@
+"""Messages of the library, which name arguments, as the user of a command reads them: flags.
+
+In a message an argument stands before the first colon (``max_memory: expected ...``) or in
+backticks (``raise `max_memory```); nothing else is touched, file names and values included.
+"""
+
+from __future__ import annotations
+
+import re
+
+# Argument of the library -> flag of the commands.
+FLAGS = {
+    "settings": "--set",
+    "hold_out": "--hold-out",
+    "from_stage": "--from",
+    "until": "--until",
+    "workers": "--workers",
+    "max_memory": "--max-memory",
+    "scheduler": "--scheduler",
+    "store": "--store",
+    "format": "--format",
+    "follow_links": "--follow-links",
+    "encoding": "--encoding",
+    "layer": "--layer",
+    "size": "--size",
+    "psnr": "--psnr",
+    "n_frames": "--orbit",
+    "elevation_deg": "--elevation",
+    "environment": "--environment",
+    "convention": "--convention",
+    "environment_up": "--environment-up",
+    "environment_rotation": "--environment-rotation",
+    "light": "--light",
+    "samples_per_pixel": "--samples",
+}
+_QUOTED = re.compile(r"`(\w+)(?:=([^`]*))?`")
+_HOLD_OUT = re.compile(r"HoldOut\((.*)\)")
+
+
+def with_flags(message: str) -> str:
+    """Return a message of the library with flags in place of arguments.
+
+    Examples
+    --------
+    >>> with_flags("max_memory: expected 2.0 GB, received 1.0 GB; raise it")
+    '--max-memory: expected 2.0 GB, received 1.0 GB; raise it'
+    >>> with_flags("a.exr: out of the folder; allow it with `follow_links=True`")
+    'a.exr: out of the folder; allow it with --follow-links'
+    >>> with_flags("hold some out with `hold_out=HoldOut(views=K, lights=K)`")
+    'hold some out with --hold-out views=K,lights=K'
+    >>> with_flags("light 'l0': start one with `dask scheduler`")
+    "light 'l0': start one with `dask scheduler`"
+    """
+    head, colon, rest = message.partition(":")
+    names = head.split(", ")
+    if colon and all(name in FLAGS for name in names):
+        message = ", ".join(FLAGS[name] for name in names) + colon + rest
+    return _QUOTED.sub(_flag, message)
+
+
+def _flag(quoted: re.Match[str]) -> str:
+    name, value = quoted.groups()
+    if name not in FLAGS:
+        return quoted.group()
+    if value in (None, "True"):
+        return FLAGS[name]
+    return f"{FLAGS[name]} {_word(value)}"
+
+
+def _word(value: str) -> str:
+    """Return a value as one word of a command line."""
+    counts = _HOLD_OUT.fullmatch(value)
+    if counts is None:
+        return value.strip("'\"")
+    return counts.group(1).replace("test=True", "test").replace(", ", ",")
