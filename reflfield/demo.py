@@ -12,7 +12,7 @@ from pathlib import Path
 from reflfield.capture.readers import open_capture
 from reflfield.errors import ReflfieldError
 from reflfield.field.clustered_pca import CompressionOptions
-from reflfield.field.fit import SampleFitOptions
+from reflfield.field.sample_fit import SampleFitOptions
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline.context import Job
 from reflfield.pipeline.pipeline_options import (
@@ -47,10 +47,12 @@ OPTIONS = PipelineOptions(
 
 # The smallest alignment and the smallest fit to samples that call all that the demo's do.
 COMPILE = """
+from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from reflfield.alignment import align
 from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.fit import SampleFitOptions, fit_samples
+from reflfield.field.coefficients import solve_coefficients
+from reflfield.field.sample_fit import SampleFitOptions, fit_basis
 from reflfield.observations.texel_samples import TexelSamples, rooted_samples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
@@ -66,13 +68,10 @@ model = ClusteredModel(
     np.ones((1, 9, 9, 6), np.float32),
     np.ones((1, 1, 1)),
 )
-fit_samples(
-    lambda some: rooted_samples(texels, frames, (3, 3), "cube_root"),
-    model,
-    np.arange(2),
-    1000,
-    SampleFitOptions(rounds=1),
-)
+samples = rooted_samples(texels, frames, (3, 3), "cube_root")
+fit_basis(lambda some: samples, model, np.arange(2), 1000, SampleFitOptions(rounds=1))
+with ThreadPoolExecutor(1) as pool:
+    solve_coefficients(samples, model.cluster, model, pool, bounded=True)
 """
 
 

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.field.sample_sums import (
-    arguments,
+    KernelSamples,
+    Taps,
     at_light,
     at_view,
     clear,
+    kernel_samples,
     parts,
     touched_nodes,
 )
@@ -44,18 +46,18 @@ def _spread_view(
     weights: Floats,
     channels: Channels,
     plane: Floats,
-    light_nodes: Ints,
-    light_taps: Floats,
+    light_taps: Taps,
     factor: Floats,
     of_samples: bool,
     spread: Floats,
 ) -> None:
     """Add the adjoint of one texel's samples from one view to `spread`."""
     at = np.zeros(plane.shape[1], np.float32)
+    nodes, taps = light_taps
     for j in range(len(values)):
         if weights[j] == 0:
             continue
-        at_light(plane, light_nodes[j], light_taps[j], at)
+        at_light(plane, nodes[j], taps[j], at)
         for c in range(3):
             value = values[j, c]
             if not of_samples:
@@ -65,13 +67,12 @@ def _spread_view(
             weight = weights[j] * (channels[j] >> c & 1)
             for k in range(len(factor)):
                 at[3 * k + c] = factor[k] * weight * value
-        _spread(spread, light_nodes[j], light_taps[j], at)
+        _spread(spread, nodes[j], taps[j], at)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _spread_over_views(
-    spread: Floats, nodes: Ints, weights: Floats, touched: Ints, out: Floats
-) -> None:
+def _spread_over_views(spread: Floats, taps: Taps, touched: Ints, out: Floats) -> None:
+    nodes, weights = taps
     for tap in range(4):
         if weights[tap] != 0:
             target = out[nodes[tap]]
@@ -82,15 +83,7 @@ def _spread_over_views(
 
 @numba.njit(cache=True, nogil=True)
 def _accumulate(
-    values: Floats,
-    view_nodes: Ints,
-    view_taps: Floats,
-    light_nodes: Ints,
-    light_taps: Floats,
-    view_weights: Floats,
-    light_weights: Floats,
-    pairs: Floats,
-    channels: Channels,
+    samples: KernelSamples,
     cluster: Ints,
     coefficients: Floats,
     table: Floats,
@@ -102,28 +95,27 @@ def _accumulate(
     spread = np.zeros(table.shape[2:], np.float32)
     factor = np.ones(table.shape[3] // 3, np.float32)
     lit = np.zeros(table.shape[2], np.int32)
-    every = np.full(values.shape[2], ALL_CHANNELS, np.uint8)
-    for t in range(len(values)):
-        touched = lit[: touched_nodes(light_nodes[t], light_weights[t], lit)]
+    every = np.full(samples.values.shape[2], ALL_CHANNELS, np.uint8)
+    for t in range(len(samples.values)):
+        light_taps = (samples.light_nodes[t], samples.light_taps[t])
+        touched = lit[: touched_nodes(light_taps[0], samples.light_weights[t], lit)]
         factor[1:] = coefficients[t]
-        for i in np.flatnonzero(view_weights[t]):
-            weights = view_weights[t, i] * light_weights[t] * pairs[i]
-            taps = (view_nodes[t, i], view_taps[t, i])
+        for i in np.flatnonzero(samples.view_weights[t]):
+            taps = (samples.view_nodes[t, i], samples.view_taps[t, i])
             clear(spread, touched)
             if not of_samples:
-                at_view(table[cluster[t]], *taps, touched, plane)
+                at_view(table[cluster[t]], taps, touched, plane)
             _spread_view(
-                values[t, i],
-                weights,
-                channels[t, i] if len(channels) else every,
+                samples.values[t, i],
+                samples.view_weights[t, i] * samples.light_weights[t] * samples.pairs[i],
+                samples.channels[t, i] if len(samples.channels) else every,
                 plane,
-                light_nodes[t],
-                light_taps[t],
+                light_taps,
                 factor,
                 of_samples,
                 spread,
             )
-            _spread_over_views(spread, *taps, touched, out[cluster[t]])
+            _spread_over_views(spread, taps, touched, out[cluster[t]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +134,7 @@ class BasisProblem:
         def part_sum(part: slice) -> Floats:
             out = np.zeros_like(table)
             _accumulate(
-                *arguments(self.rooted, part),
+                kernel_samples(self.rooted, part),
                 self.cluster[part],
                 self.coefficients[part],
                 table,

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from reflfield.errors import InputError
 from reflfield.factorization import Completion, LocalPCA
 from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.fit import SampleFitOptions
+from reflfield.field.sample_fit import SampleFitOptions
 from reflfield.util.validation import check_ranges
 
 Floats = NDArray[np.float32]
@@ -51,7 +51,8 @@ class CompressionOptions:
     samples : SampleFitOptions
     size : int
         Bytes that the file may have, 0: as many as `coarseness` gives. Clusters, components
-        and quantisation are then chosen by the error that they leave; see `field.rate`.
+        and quantisation are then chosen by the error that they leave; see
+        `field.quantisation_search`.
     psnr : float
         LDR PSNR, dB, that the field is to have on the samples that it is made of, 0: as it
         comes. Clusters, components and quantisation are then chosen for the smallest file.

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 
 from reflfield.field.bounds import exceeds, probes, raise_top
 from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.sample_sums import arguments, at_light, at_view, parts, touched_nodes
+from reflfield.field.sample_sums import (
+    KernelSamples,
+    Taps,
+    at_light,
+    at_view,
+    kernel_samples,
+    parts,
+    touched_nodes,
+)
 from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, RootedSamples
 
 Floats = NDArray[np.float32]
@@ -32,8 +40,7 @@ def _add_normal_equations(
     weights: Floats,
     channels: Channels,
     plane: Floats,
-    light_nodes: Ints,
-    light_taps: Floats,
+    light_taps: Taps,
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
     squares: NDArray[np.float64],
@@ -44,10 +51,11 @@ def _add_normal_equations(
     """
     n_components = len(right)
     at = np.zeros(plane.shape[1], np.float32)
+    nodes, taps = light_taps
     for j in range(len(values)):
         if weights[j] == 0:
             continue
-        at_light(plane, light_nodes[j], light_taps[j], at)
+        at_light(plane, nodes[j], taps[j], at)
         for c in range(3):
             if not channels[j] >> c & 1:
                 continue
@@ -72,9 +80,9 @@ def _solve_texel(
 ) -> None:
     """Coefficients of one texel; its squared residual falls by what they explain."""
     full = np.tril(normal) + np.tril(normal, -1).T
-    found = np.linalg.solve(full + precision, right)
-    coefficients[:] = found
-    explained = 2 * np.dot(found, right) - np.dot(found, np.dot(full, found))
+    mean = np.linalg.solve(full + precision, right)
+    coefficients[:] = mean
+    explained = 2 * np.dot(mean, right) - np.dot(mean, np.dot(full, mean))
     squares[0] = max(squares[0] - explained, 0.0)
     # Each coefficient that the samples determine takes one of the values, of mean weight:
     # without this the noise is underestimated, the prior is too weak, and texels with few
@@ -128,15 +136,7 @@ def _count_values(weights: Floats, channels: Channels) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _solve_coefficients(
-    values: Floats,
-    view_nodes: Ints,
-    view_taps: Floats,
-    light_nodes: Ints,
-    light_taps: Floats,
-    view_weights: Floats,
-    light_weights: Floats,
-    pairs: Floats,
-    channels: Channels,
+    samples: KernelSamples,
     cluster: Ints,
     table: Floats,
     precision: NDArray[np.float64],
@@ -147,27 +147,28 @@ def _solve_coefficients(
     n_components = precision.shape[1]
     plane = np.zeros(table.shape[2:], np.float32)
     lit = np.zeros(table.shape[2], np.int32)
-    every = np.full(values.shape[2], ALL_CHANNELS, np.uint8)
-    for t in range(len(values)):
-        touched = lit[: touched_nodes(light_nodes[t], light_weights[t], lit)]
+    every = np.full(samples.values.shape[2], ALL_CHANNELS, np.uint8)
+    for t in range(len(samples.values)):
+        light_taps = (samples.light_nodes[t], samples.light_taps[t])
+        touched = lit[: touched_nodes(light_taps[0], samples.light_weights[t], lit)]
         normal = np.zeros((n_components, n_components))
         right = np.zeros(n_components)
         n_values = 0
         top = np.zeros(3, np.float32)
-        for i in np.flatnonzero(view_weights[t]):
-            weights = view_weights[t, i] * light_weights[t] * pairs[i]
-            measured = channels[t, i] if len(channels) else every
+        for i in np.flatnonzero(samples.view_weights[t]):
+            values = samples.values[t, i]
+            weights = samples.view_weights[t, i] * samples.light_weights[t] * samples.pairs[i]
+            measured = samples.channels[t, i] if len(samples.channels) else every
             n_values += _count_values(weights, measured)
-            raise_top(values[t, i], weights, measured, top)
-            taps = (view_nodes[t, i], view_taps[t, i])
-            at_view(table[cluster[t]], *taps, touched, plane)
+            raise_top(values, weights, measured, top)
+            taps = (samples.view_nodes[t, i], samples.view_taps[t, i])
+            at_view(table[cluster[t]], taps, touched, plane)
             _add_normal_equations(
-                values[t, i],
+                values,
                 weights,
                 measured,
                 plane,
-                light_nodes[t],
-                light_taps[t],
+                light_taps,
                 normal,
                 right,
                 squares[t],
@@ -217,7 +218,7 @@ def solve_coefficients(
 
     def solve(part: slice) -> None:
         _solve_coefficients(
-            *arguments(rooted, part),
+            kernel_samples(rooted, part),
             cluster[part],
             model.table,
             model.precision,

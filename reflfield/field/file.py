@@ -1,7 +1,7 @@
 """The file of a reflectance field, `field.rfld`, version 3.
 
 A ZIP archive of `header.json` and one member for each array of `model.ARRAYS`, packed as
-`packing` describes. The header names format and version and, for each array, its dtype,
+`array_coding` describes. The header names format and version and, for each array, its dtype,
 shape, filter, context bits and the SHA-256 of its member. Time stamps are fixed, so equal
 fields give equal bytes.
 
@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import FieldFileError, InputError
-from reflfield.field.packing import FILTERS, pack, unpack
+from reflfield.field.array_coding import FILTERS, pack, unpack
 from reflfield.field.reflectance_field import (
     ARRAYS,
     ReflectanceField,

@@ -1,15 +1,14 @@
-r"""Frames improved against the model that is fitted to the samples.
+r"""Refinement of frames against the model that is fitted to the samples.
 
-A sample y of a texel is to be :math:`D(y) = g(l)\, u(v, l)`: D the domain, u the texel's own
-function (mean, basis and coefficients), :math:`g = s^{1/p}` the softened cosine in the domain
-of power p. Turning the texel's frame moves its views v and lights l over the nodes.
-Gauss-Newton steps on the squares of the difference, those that the fit minimises, turn
-it; the texel's gain is free, and a Gaussian prior holds the frame to the one given.
+A sample y of a texel is modelled as :math:`D(y) = g(l)\, u(v, l)`: D the transform (cube
+root), u the texel's own function (mean, basis and coefficients), :math:`g = s^{1/p}` the
+transformed softened cosine s, p the power of the inverse transform. A rotation of the texel's
+frame moves its views v and lights l over the nodes. Gauss-Newton steps minimise the squared
+differences, as the fit does; the texel's gain is free, and a Gaussian prior holds the frame
+to the one given.
 """
 
 from __future__ import annotations
-
-from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -23,7 +22,6 @@ from reflfield.field.clustered_model import ClusteredModel
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.observations.texel_samples import POWERS, root
 from reflfield.sphere.hemisphere import place_directions, softened_cosine_of
-from reflfield.util.progress import track
 from reflfield.util.validation import check_shape
 
 Floats = NDArray[np.float32]
@@ -32,7 +30,6 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 STEPS = 3
-TEXELS_AT_ONCE = 256
 # Half of the step that the cosine's slope is differenced over: the softened band is 80 wide.
 COSINE_STEP = 1e-3
 
@@ -167,7 +164,7 @@ def _add_texel(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _improve_texel(
+def _refine_texel(
     values: Floats,
     directions: tuple[Doubles, Doubles],
     counts: tuple[Bools, Bools, Bools],
@@ -207,7 +204,7 @@ def _improve_texel(
 
 
 @numba.njit(cache=True, nogil=True)
-def _improve(
+def _refine(
     values: Floats,
     directions: tuple[Doubles, Doubles],
     seen: tuple[Bools, Bools],
@@ -223,7 +220,7 @@ def _improve(
     nodes = np.zeros((table.shape[1], table.shape[2], 3))
     for i in range(values.shape[0]):
         _own_function(table[cluster[i]], coefficients[i], nodes)
-        _improve_texel(
+        _refine_texel(
             values[i],
             (directions[0][i], directions[1][i]),
             (seen[0][i], seen[1][i], pairs),
@@ -235,15 +232,10 @@ def _improve(
         )
 
 
-def improved_frames(
-    reader: TexelReader,
-    model: ClusteredModel,
-    texels: NDArray[np.intp],
-    spread: float,
-    *,
-    workers: int = 1,
+def refined_frames(
+    reader: TexelReader, model: ClusteredModel, texels: NDArray[np.intp], spread: float
 ) -> Floats:
-    """Frames of texels, turned to where a model explains their samples better.
+    """Rotate frames of texels to where a model explains their samples better.
 
     Parameters
     ----------
@@ -252,47 +244,35 @@ def improved_frames(
     model : ClusteredModel
         Fitted in these frames.
     texels : (k,) int
-        Whose frames may turn; they have samples.
+        Texels that have samples.
     spread : float
         Standard deviation of the given frames about the true ones, each axis, radians.
-    workers : int
-        Threads; the result does not depend on it.
 
     Returns
     -------
-    (n_texels, 3, 3) float32
-        `local_from_world` of all texels.
+    (k, 3, 3) float32
+        `local_from_world` of these texels.
+
+    Raises
+    ------
+    ShapeError
+        If the model has other nodes than the reader's grids.
 
     Notes
     -----
     The prior weighs against the samples by the texel's own mean squared residual. Samples
-    within a degree of the frame's horizon, or below it, have no say.
+    within a degree of the frame's horizon, or below it, are excluded.
     """
-    frames = reader.local_from_world.copy()
-    size = TEXELS_AT_ONCE
-    blocks = [texels[first : first + size] for first in range(0, len(texels), size)]
-    with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(lambda rows: improved_block(reader, model, rows, spread), blocks)
-        for rows, part in track(
-            zip(blocks, found, strict=True), len(blocks), "frames against the model"
-        ):
-            frames[rows] = part
-    return frames
-
-
-def improved_block(
-    reader: TexelReader, model: ClusteredModel, texels: NDArray[np.intp], spread: float
-) -> Floats:
-    """Frames (k, 3, 3) of some texels; see `improved_frames`."""
     n_nodes = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     check_shape("model.table", model.table, (None, *n_nodes, None))
-    found = reader.measured(texels)
+    measured = reader.measured(texels)
+    samples = measured.samples.astype(np.float32) * np.float32(measured.unit)
     frames = reader.local_from_world[texels].astype(np.float64)
-    _improve(
-        root(found.samples.astype(np.float32) * np.float32(found.unit), reader.options.domain),
-        (found.views.astype(np.float64), found.lights.astype(np.float64)),
-        (found.view_seen, found.light_seen),
-        found.pairs,
+    _refine(
+        root(samples, reader.options.domain),
+        (measured.views.astype(np.float64), measured.lights.astype(np.float64)),
+        (measured.view_seen, measured.light_seen),
+        measured.pairs,
         model.table,
         model.cluster[texels],
         model.coefficients[texels],

@@ -1,8 +1,12 @@
-"""Few bits per number: points on a lattice, rotations as turns from one to the next."""
+"""Integer codes of numbers: coefficients, points on a lattice, rotations.
+
+Each rotation is coded as the rotation vector that leads to it from the one before it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -14,6 +18,9 @@ from reflfield.util.validation import check_shape
 
 # Half a turn in steps of this fits the codes of a turn.
 SMALLEST_TURN = 1e-4
+# A function whose component orthogonal to the others is below this share of the strongest is
+# linearly dependent on them.
+RANK_TOLERANCE = 1e-5
 
 
 def check_finite(name: str, values: NDArray[np.floating]) -> None:
@@ -237,3 +244,85 @@ def check_rotations(matrices: NDArray[np.float64]) -> None:
             f"frames: expected right-handed orthonormal matrices, received "
             f"{matrices[row].tolist()} in row {row}"
         )
+
+
+# --- coefficients ------------------------------------------------------------------------
+
+
+def smallest_codes(array: NDArray[Any]) -> NDArray[Any]:
+    """Integers in the smallest signed type that holds them; other arrays unchanged.
+
+    Raises
+    ------
+    InputError
+        If one needs more than 32 bits.
+
+    Examples
+    --------
+    >>> smallest_codes(np.array([1, -200])).dtype
+    dtype('int16')
+    """
+    if array.dtype.kind != "i":
+        return array
+    largest = int(np.abs(array.astype(np.int64)).max(initial=0))
+    kinds = [kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max]
+    if not kinds:
+        raise InputError(
+            f"quantisation: expected steps whose codes fit 32 bits, received some of "
+            f"{largest}; "
+            "make them coarser (compression.coarseness)"
+        )
+    return np.ascontiguousarray(array, dtype=kinds[0])
+
+
+def lattice_codes(
+    moments: NDArray[np.floating], gram: NDArray[np.float64], step: float
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    r"""Integer coefficients whose sum of functions comes close to given functions.
+
+    Babai's nearest plane: with the Gram matrix :math:`B B^\top = R^\top R`, coefficients are
+    rounded from the last to the first, each after the rounding errors of those before it were
+    subtracted [1]_.
+
+    Parameters
+    ----------
+    moments : (n, K) float
+        Products of the given functions with the K functions B, mean over the nodes.
+    gram : (K, K) float64
+        Products of the functions with each other, mean over the nodes.
+    step : float
+        In root mean square over the nodes.
+
+    Returns
+    -------
+    codes : (n, K) int32
+    scale : (K,) float32
+        Coefficients are codes times this; zero for a function that is linearly dependent.
+
+    References
+    ----------
+    .. [1] L. Babai, "On Lovász' lattice reduction and the nearest lattice point problem",
+       Combinatorica 6, 1986.
+
+    Examples
+    --------
+    >>> functions, wanted = np.array([[1.0, 0.0], [0.6, 0.8]]), np.array([[0.25, -0.5]])
+    >>> codes, scale = lattice_codes(wanted @ functions.T, functions @ functions.T, 0.1)
+    >>> codes.tolist(), ((codes * scale) @ functions).round(2).tolist()
+    ([[6, -5]], [[0.23, -0.5]])
+    """
+    n, k = moments.shape
+    codes, scale = np.zeros((n, k), np.int32), np.zeros(k, np.float32)
+    largest = float(np.diagonal(gram).max(initial=0.0))
+    if not largest > 0:
+        return codes, scale
+    root = np.linalg.cholesky(gram + 1e-12 * largest * np.eye(k)).T
+    aims = np.linalg.solve(root.T, moments.T.astype(np.float64)).T
+    independent = np.diagonal(root) > RANK_TOLERANCE * np.sqrt(largest)
+    scale[independent] = step / np.diagonal(root)[independent]
+    decoded = np.zeros((n, k))
+    for i in reversed(np.flatnonzero(independent)):
+        rest = (aims[:, i] - decoded @ root[i]) / root[i, i]
+        codes[:, i] = np.rint(rest / np.float64(scale[i]))
+        decoded[:, i] = codes[:, i] * np.float64(scale[i])
+    return codes, scale

@@ -18,7 +18,7 @@ Where shadows were factored out, a texel that a light does not reach shows indir
 (`field.indirect`): a mean and a few functions of the light's direction in the world, shared by
 all texels, with coefficients of its own.
 
-Arrays are kept as they are stored, quantised (`field.transform`, `field.quantisation`);
+Arrays are kept as they are stored, quantised (`field.tucker_coding`, `field.quantisation`);
 properties decode them when first asked for. A field opened from a file reads only what is
 used.
 """
@@ -42,7 +42,7 @@ from reflfield.field.quantisation import (
     check_finite,
     rotations_from_codes,
 )
-from reflfield.field.transform import unfactor_table
+from reflfield.field.tucker_coding import unfactor_table
 from reflfield.util.blas_threads import one_core_blas
 from reflfield.util.validation import unit_direction
 
@@ -94,7 +94,7 @@ ARRAYS: dict[str, tuple[tuple[str, ...], tuple[str | int, ...]]] = {
 
 @dataclass(frozen=True, eq=False)
 class ReflectanceField:
-    """A fitted reflectance field. Made by `building.build_field` or `file.open_field`.
+    """A fitted reflectance field. Made by `build.build_field` or `file.open_field`.
 
     Parameters
     ----------

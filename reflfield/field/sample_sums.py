@@ -1,4 +1,4 @@
-"""What all sums over samples share: functions on the nodes at the directions of samples.
+"""Kernels that all sums over samples share: functions on the nodes at directions of samples.
 
 A table (n_view_nodes, n_light_nodes, width) is interpolated at a sample's view first, which
 leaves functions of the light alone, and only at the light nodes that the texel's samples lie
@@ -9,33 +9,65 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.observations.texel_samples import RootedSamples
+from reflfield.observations.texel_samples import Channels, RootedSamples
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
+# Nodes and interpolation weights of some directions.
+Taps = tuple[Ints, Floats]
 
 # Partial sums are formed for this many parts and added in order, so that the result does
 # not depend on the number of workers.
 N_PARTS = 8
 
 
+class KernelSamples(NamedTuple):
+    """Arrays of some texels' samples as the kernels take them; see `RootedSamples`."""
+
+    values: Floats
+    view_nodes: Ints
+    view_taps: Floats
+    light_nodes: Ints
+    light_taps: Floats
+    view_weights: Floats
+    light_weights: Floats
+    pairs: Floats
+    channels: Channels
+
+
+def kernel_samples(rooted: RootedSamples, part: slice) -> KernelSamples:
+    """Samples of some texels for the kernels."""
+    return KernelSamples(
+        values=rooted.values[part],
+        view_nodes=rooted.view_taps[0][part],
+        view_taps=rooted.view_taps[1][part],
+        light_nodes=rooted.light_taps[0][part],
+        light_taps=rooted.light_taps[1][part],
+        view_weights=rooted.view_weights[part],
+        light_weights=rooted.light_weights[part],
+        pairs=rooted.pairs,
+        channels=rooted.channels[part],
+    )
+
+
 @numba.njit(cache=True, nogil=True)
-def touched_nodes(nodes: Ints, weights: Floats, found: Ints) -> int:
-    """Number of light nodes that samples of one texel lie between; they are put in `found`."""
-    is_touched = np.zeros(len(found), np.bool_)
+def touched_nodes(nodes: Ints, weights: Floats, touched: Ints) -> int:
+    """Put the light nodes that samples of one texel lie between in `touched`; their number."""
+    is_touched = np.zeros(len(touched), np.bool_)
     for j in range(len(nodes)):
         if weights[j] != 0:
             for tap in range(4):
                 is_touched[nodes[j, tap]] = True
     count = 0
-    for node in range(len(found)):
+    for node in range(len(touched)):
         if is_touched[node]:
-            found[count] = node
+            touched[count] = node
             count += 1
     return count
 
@@ -49,8 +81,9 @@ def clear(plane: Floats, touched: Ints) -> None:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def at_view(table: Floats, nodes: Ints, weights: Floats, touched: Ints, out: Floats) -> None:
+def at_view(table: Floats, taps: Taps, touched: Ints, out: Floats) -> None:
     """Functions of the light alone, at the nodes that matter."""
+    nodes, weights = taps
     clear(out, touched)
     for tap in range(4):
         weight = weights[tap]
@@ -69,21 +102,6 @@ def at_light(plane: Floats, nodes: Ints, weights: Floats, out: Floats) -> None:
         weight = weights[tap]
         for k in range(out.shape[0]):
             out[k] += weight * plane[nodes[tap], k]
-
-
-def arguments(rooted: RootedSamples, part: slice) -> tuple[NDArray[np.generic], ...]:
-    """Arrays of some texels' samples, in the order in which the sums take them."""
-    return (
-        rooted.values[part],
-        rooted.view_taps[0][part],
-        rooted.view_taps[1][part],
-        rooted.light_taps[0][part],
-        rooted.light_taps[1][part],
-        rooted.view_weights[part],
-        rooted.light_weights[part],
-        rooted.pairs,
-        rooted.channels[part],
-    )
 
 
 def parts(n: int) -> Iterator[slice]:

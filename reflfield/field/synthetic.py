@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.field.building import BaseSurface, FittedReflectance, build_field
+from reflfield.field.build import BaseSurface, FittedReflectance, build_field
 from reflfield.field.reflectance_field import INVERSE_POWER, Domain, ReflectanceField
 from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.sphere.rotations import frames_from_normals

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from reflfield.field.indirect_light import fit_indirect
+from reflfield.field.indirect_fit import fit_indirect
 from reflfield.observations.texel_reading import Shade, TexelReader
 from reflfield.pipeline.atlas import pixel_width
 from reflfield.pipeline.context import Job

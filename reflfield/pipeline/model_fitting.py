@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.field.clustered_model import ClusteredModel, of_usual_size
+from reflfield.field.clustered_model import (
+    ClusteredModel,
+    of_usual_size,
+    on_refined_grid,
+    refined_sides,
+)
 from reflfield.field.clustered_pca import CompressionOptions, cluster_completed, fill_unobserved
 from reflfield.field.coefficients import solve_coefficients
-from reflfield.field.fineness import finer_sides, on_finer_nodes
-from reflfield.field.fit import SampleFitOptions, fit_basis
-from reflfield.field.frame_refinement import improved_block as turned
+from reflfield.field.frame_refinement import refined_frames
+from reflfield.field.sample_fit import SampleFitOptions, fit_basis
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline.alignment import local_frames
 from reflfield.pipeline.context import Job
@@ -133,8 +137,8 @@ def _fitted_to_samples(
         frames[free] = better.joined("frames")
         reader = reader.rotated(frames)
     n_functions = len(model.table) * (model.coefficients.shape[1] + 1)
-    sides = finer_sides(reader.sides, n_functions, options.fineness)
-    model, reader = on_finer_nodes(model, sides), replace(reader, sides=sides)
+    sides = refined_sides(reader.sides, n_functions, options.fineness)
+    model, reader = on_refined_grid(model, sides), replace(reader, sides=sides)
     return _fitted_once(job, model, reader, second, blocks, f"{name}, part 2"), reader
 
 
@@ -146,7 +150,7 @@ def _fitted_once(
     blocks: Blocks,
     part: str,
 ) -> ClusteredModel:
-    """Basis of some texels, then coefficients of all: `fit_samples` by blocks."""
+    """Basis of some texels, then coefficients of all: all samples by blocks."""
 
     def basis() -> dict[str, NDArray[Any]]:
         found = fit_basis(
@@ -192,7 +196,7 @@ class SampleFit:
 
 def turned_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
     """Frames of some texels, improved against the model."""
-    return {"frames": turned(context.reader, context.model, texels, context.spread)}
+    return {"frames": refined_frames(context.reader, context.model, texels, context.spread)}
 
 
 def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.field.building import (
+from reflfield.field.build import (
     BaseSurface,
     FittedReflectance,
     Quantisation,
@@ -20,7 +20,7 @@ from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.file import PackedSizes
 from reflfield.field.observed_sphere import distinct_directions
-from reflfield.field.rate import field_of_quality, field_of_size
+from reflfield.field.quantisation_search import field_of_quality, field_of_size
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.image_projection import directions_of

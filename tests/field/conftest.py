@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reflfield.field.building import BaseSurface, FittedReflectance, build_field
+from reflfield.field.build import BaseSurface, FittedReflectance, build_field
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.sphere.rotations import matrix_from_quaternion
 

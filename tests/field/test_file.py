@@ -11,7 +11,7 @@ import pytest
 
 from reflfield.errors import FieldFileError, InputError
 from reflfield.field import file as field_file
-from reflfield.field.building import Quantisation
+from reflfield.field.build import Quantisation
 from reflfield.field.evaluation import evaluate
 from reflfield.field.file import FORMAT_VERSION, describe, open_field, write_field
 from reflfield.field.reflectance_field import ARRAYS

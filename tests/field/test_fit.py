@@ -11,7 +11,7 @@ from reflfield.field.basis import BasisProblem, roughness
 from reflfield.field.bounds import MOST_OF_MEAN
 from reflfield.field.clustered_model import ClusteredModel, normalised, of_usual_size
 from reflfield.field.coefficients import solve_coefficients
-from reflfield.field.fit import SampleFitOptions, fit_basis, fit_samples
+from reflfield.field.sample_fit import SampleFitOptions, fit_basis
 from reflfield.observations.texel_samples import CHANNEL_BITS, RootedSamples, all_channels
 from reflfield.sphere.hemisphere import HemisphereGrid
 
@@ -339,7 +339,7 @@ def disturbed(model, rng):
 
 def fitted(samples, start, *, observed=None, workers=1, max_bytes=192 << 20, **options):
     observed = np.arange(len(samples.values)) if observed is None else observed
-    return fit_samples(
+    model = fit_basis(
         lambda texels: part(samples, texels),
         start,
         observed,
@@ -347,6 +347,12 @@ def fitted(samples, start, *, observed=None, workers=1, max_bytes=192 << 20, **o
         SampleFitOptions(**{"smoothness": 1e-4, "max_bytes": max_bytes} | options),
         workers=workers,
     )
+    coefficients = model.coefficients.copy()
+    with ThreadPoolExecutor(workers) as pool:
+        coefficients[observed], _ = solve_coefficients(
+            part(samples, observed), model.cluster[observed], model, pool, bounded=True
+        )
+    return replace(model, coefficients=coefficients)
 
 
 class TestFit:

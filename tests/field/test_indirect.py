@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.building import FittedReflectance, Quantisation, build_field
+from reflfield.field.build import FittedReflectance, Quantisation, build_field
 from reflfield.field.evaluation import sum_lights
-from reflfield.field.indirect_light import (
-    IndirectLight,
+from reflfield.field.indirect_fit import (
     Systems,
     band_limit_for,
     fit_indirect,
-    no_indirect_light,
 )
+from reflfield.field.indirect_light import IndirectLight, no_indirect_light
 from reflfield.field.observed_sphere import covered
 from reflfield.field.synthetic import square_surface
 from reflfield.observations.texel_reading import Shade

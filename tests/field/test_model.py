@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.building import (
+from reflfield.field.build import (
     POSITION_STEPS,
     Quantisation,
     build_field,
@@ -19,15 +19,12 @@ from reflfield.field.building import (
 from reflfield.field.file import open_field, write_field
 from reflfield.field.quantisation import (
     codes_from_rotations,
+    lattice_codes,
     lattice_points,
     rotations_from_codes,
-)
-from reflfield.field.transform import (
-    factor_table,
-    lattice_codes,
     smallest_codes,
-    unfactor_table,
 )
+from reflfield.field.tucker_coding import factor_table, unfactor_table
 from reflfield.sphere.rotations import matrix_from_quaternion, rotation_angle
 
 

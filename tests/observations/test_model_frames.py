@@ -1,4 +1,4 @@
-"""Frames improved against a model: planted frames come back, steps follow the true slopes."""
+"""Frames refined against a model: planted frames come back, steps follow the true slopes."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from reflfield.errors import ShapeError
 from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.frame_refinement import _add_texel, _gains, _own_function, improved_frames
+from reflfield.field.frame_refinement import _add_texel, _gains, _own_function, refined_frames
 from reflfield.observations.frame_resampling import ResamplingOptions
 from reflfield.observations.image_projection import pairs_photographed
 from reflfield.observations.store import (
@@ -89,7 +89,7 @@ def angles(frames, truth):
 
 def test_planted_frames_come_back(planted, model):
     reader, truth = planted
-    found = improved_frames(reader, model, np.arange(N), SPREAD)
+    found = refined_frames(reader, model, np.arange(N), SPREAD)
     before, after = angles(reader.local_from_world, truth), angles(found, truth)
     # Half floats, a bilinear target and three steps leave a few hundredths.
     assert before.mean() > 2.5
@@ -97,7 +97,7 @@ def test_planted_frames_come_back(planted, model):
     assert after.mean() < 0.1 * before.mean()
 
 
-def test_values_not_measured_have_no_say(planted, model, rng):
+def test_values_not_measured_are_excluded(planted, model, rng):
     """Of half of the values nothing is known: frames come back from the others."""
     reader, truth = planted
     stored = open_samples(reader.store.location)
@@ -105,27 +105,24 @@ def test_values_not_measured_have_no_say(planted, model, rng):
     values[rng.random(values.shape) < 0.5] = np.nan
     stored[:] = values
     before = angles(reader.local_from_world, truth)
-    found = improved_frames(reader, model, np.arange(N), SPREAD)
+    found = refined_frames(reader, model, np.arange(N), SPREAD)
     # Less near than with all of them; were NaN a value, none would come back at all.
     assert np.median(angles(found, truth)) < 0.06 * np.median(before)
 
 
-def test_texels_not_named_and_a_spread_of_nothing_keep_their_frames(planted, model):
+def test_a_spread_of_nothing_keeps_the_frames(planted, model):
     reader, _ = planted
     some = np.arange(0, N, 2)
-    found = improved_frames(reader, model, some, SPREAD)
-    np.testing.assert_array_equal(found[1::2], reader.local_from_world[1::2])
-    held = improved_frames(reader, model, some, 1e-9)
-    assert angles(held, reader.local_from_world).max() < 1e-4
+    held = refined_frames(reader, model, some, 1e-9)
+    assert angles(held, reader.local_from_world[some]).max() < 1e-4
 
 
-def test_threads_do_not_change_the_frames(planted, model, monkeypatch):
+def test_blocks_do_not_change_the_frames(planted, model):
     reader, _ = planted
-    one = improved_frames(reader, model, np.arange(N), SPREAD)
-    monkeypatch.setattr("reflfield.field.frame_refinement.TEXELS_AT_ONCE", 7)
-    np.testing.assert_array_equal(
-        improved_frames(reader, model, np.arange(N), SPREAD, workers=3), one
-    )
+    whole = refined_frames(reader, model, np.arange(N), SPREAD)
+    first, last = np.split(np.arange(N), [7])
+    blocks = [refined_frames(reader, model, rows, SPREAD) for rows in (first, last)]
+    np.testing.assert_array_equal(np.concatenate(blocks), whole)
 
 
 @pytest.mark.stability
@@ -133,7 +130,7 @@ def test_texels_without_samples_keep_their_frames(planted, model):
     reader, _ = planted
     reader.store.observed.views[5] = False
     reader.store.observed.lights[8] = False
-    found = improved_frames(reader, model, np.arange(N), SPREAD)
+    found = refined_frames(reader, model, np.arange(N), SPREAD)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found[[5, 8]], reader.local_from_world[[5, 8]], atol=1e-6)
 
@@ -177,4 +174,4 @@ def test_normal_equations_are_the_slopes_of_the_squares(model, rng):
 def test_model_of_other_grids_is_refused(planted, model):
     reader, _ = planted
     with pytest.raises(ShapeError, match=r"model\.table"):
-        improved_frames(replace(reader, sides=(5, 7)), model, np.arange(N), SPREAD)
+        refined_frames(replace(reader, sides=(5, 7)), model, np.arange(N), SPREAD)

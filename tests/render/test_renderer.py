@@ -8,7 +8,7 @@ import pytest
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
-from reflfield.field.building import FittedReflectance, build_field
+from reflfield.field.build import FittedReflectance, build_field
 from reflfield.field.evaluation import evaluate, texel_taps
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.synthetic import (

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.errors import InputError
+from reflfield.field.quantisation import smallest_codes
 
 Floats = NDArray[np.float64]
 
@@ -37,8 +37,6 @@ FACTORS = ("function", "view", "light")
 DEADZONE = 0.6
 # A function that no texel uses still has this weight, and none more than the largest.
 LARGEST_WEIGHT = 4096.0
-# A function whose part across the others is below this share of the strongest is left out.
-LEAST_NEWS = 1e-5
 
 
 def factor_table(table: NDArray[np.floating], weights: Floats, step: float) -> dict[str, Any]:
@@ -140,77 +138,3 @@ def _drop_empty(arrays: dict[str, Any]) -> None:
         arrays["core"] = np.compress(used, arrays["core"], axis=axis)
         arrays[f"{name}_factor"] = arrays[f"{name}_factor"][:, used]
         arrays[f"{name}_scale"] = arrays[f"{name}_scale"][used]
-
-
-def smallest_codes(array: NDArray[Any]) -> NDArray[Any]:
-    """Integers in the smallest signed type that holds them; other arrays unchanged.
-
-    Raises
-    ------
-    InputError
-        If one needs more than 32 bits.
-
-    Examples
-    --------
-    >>> smallest_codes(np.array([1, -200])).dtype
-    dtype('int16')
-    """
-    if array.dtype.kind != "i":
-        return array
-    largest = int(np.abs(array.astype(np.int64)).max(initial=0))
-    kinds = [kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max]
-    if not kinds:
-        raise InputError(
-            f"quantisation: expected steps whose codes fit 32 bits, received some of "
-            f"{largest}; "
-            "make them coarser (compression.coarseness)"
-        )
-    return np.ascontiguousarray(array, dtype=kinds[0])
-
-
-def lattice_codes(
-    moments: NDArray[np.floating], gram: Floats, step: float
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    r"""Integer coefficients whose sum of functions comes close to what is wanted.
-
-    Nearest plane: with the Gram matrix :math:`B B^\top = R^\top R`, coefficients are rounded
-    from the last to the first, each after the rounding errors of those before it were taken
-    off.
-
-    Parameters
-    ----------
-    moments : (n, K) float
-        Products of what is wanted with the K functions B, mean over the nodes.
-    gram : (K, K) float64
-        Products of the functions with each other, mean over the nodes.
-    step : float
-        In root mean square over the nodes.
-
-    Returns
-    -------
-    codes : (n, K) int32
-    scale : (K,) float32
-        Coefficients are codes times this; zero for a function that says nothing new.
-
-    Examples
-    --------
-    >>> functions, wanted = np.array([[1.0, 0.0], [0.6, 0.8]]), np.array([[0.25, -0.5]])
-    >>> codes, scale = lattice_codes(wanted @ functions.T, functions @ functions.T, 0.1)
-    >>> codes.tolist(), ((codes * scale) @ functions).round(2).tolist()
-    ([[6, -5]], [[0.23, -0.5]])
-    """
-    n, k = moments.shape
-    codes, scale = np.zeros((n, k), np.int32), np.zeros(k, np.float32)
-    largest = float(np.diagonal(gram).max(initial=0.0))
-    if not largest > 0:
-        return codes, scale
-    root = np.linalg.cholesky(gram + 1e-12 * largest * np.eye(k)).T
-    aims = np.linalg.solve(root.T, moments.T.astype(np.float64)).T
-    said = np.diagonal(root) > LEAST_NEWS * np.sqrt(largest)
-    scale[said] = step / np.diagonal(root)[said]
-    found = np.zeros((n, k))
-    for i in reversed(np.flatnonzero(said)):
-        rest = (aims[:, i] - found @ root[i]) / root[i, i]
-        codes[:, i] = np.rint(rest / np.float64(scale[i]))
-        found[:, i] = codes[:, i] * np.float64(scale[i])
-    return codes, scale

@@ -18,7 +18,9 @@ from reflfield.field.quantisation import (
     SMALLEST_TURN,
     check_finite,
     codes_from_rotations,
+    lattice_codes,
     lattice_points,
+    smallest_codes,
 )
 from reflfield.field.reflectance_field import (
     Domain,
@@ -30,12 +32,7 @@ from reflfield.field.reflectance_field import (
     check_options,
     node_side,
 )
-from reflfield.field.transform import (
-    factor_table,
-    lattice_codes,
-    smallest_codes,
-    unfactor_table,
-)
+from reflfield.field.tucker_coding import factor_table, unfactor_table
 from reflfield.util.blas_threads import one_core_blas
 from reflfield.util.validation import check_shape
 

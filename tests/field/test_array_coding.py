@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from reflfield.field.packing import FILTERS, pack, unpack
+from reflfield.field.array_coding import FILTERS, pack, unpack
 
 TYPES = ("int8", "int16", "int32", "uint8", "uint16", "float32")
 

@@ -1,4 +1,4 @@
-r"""Basis and coefficients fitted to the samples themselves.
+r"""Fit of mean, basis and coefficients to the samples themselves.
 
 Aligned texels of one cluster see one reflectance from many directions. Instead of
 resampling each texel and fitting the result, the model
@@ -6,8 +6,8 @@ resampling each texel and fitting the result, the model
 .. math:: u_{tij} = \sum_{n \in T_i} \sum_{m \in T_j} a_{in} b_{jm}
           \Big( M_{nm} + \sum_k c_{tk} B_{k,nm} \Big)
 
-is fitted to all samples u (in the domain) of all texels at once: T and a, b are the taps
-and weights of a sample's view and light. Mean M and basis B of every cluster follow by
+is fitted to all samples u (transformed) of all texels at once: T and a, b are the taps and
+weights of a sample's view and light. Mean M and basis B of every cluster follow by
 conjugate gradients on the regularised normal equations, coefficients c by a small solve
 per texel with a Gaussian prior; the two alternate.
 """
@@ -26,7 +26,7 @@ from reflfield.field.basis import BasisProblem
 from reflfield.field.clustered_model import ClusteredModel, normalised
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.observations.texel_samples import RootedSamples
-from reflfield.util.progress import report, track
+from reflfield.util.progress import report
 from reflfield.util.validation import check_ranges
 
 Reader = Callable[[NDArray[np.intp]], RootedSamples]
@@ -54,7 +54,7 @@ class SampleFitOptions:
         0 keeps them.
     fineness : float
         Intervals between nodes in the second half of the rounds over those of the grid of the
-        resampling (`field.fineness`). 1 keeps that grid.
+        resampling (`field.clustered_model`). 1 keeps that grid.
     max_bytes : int
         Samples of the texels that shape the basis are held in memory up to this size;
         coefficients are found for all texels, block by block.
@@ -88,9 +88,9 @@ class SampleFitOptions:
         return replace(self, rounds=first), replace(self, rounds=max(1, self.rounds - first))
 
 
-def fit_samples(
+def fit_basis(
     read: Reader,
-    start: ClusteredModel,
+    initial: ClusteredModel,
     observed: NDArray[np.intp],
     bytes_per_texel: int,
     options: SampleFitOptions,
@@ -98,13 +98,13 @@ def fit_samples(
     workers: int = 1,
     seed: int = 0,
 ) -> ClusteredModel:
-    """Fit mean, basis and coefficients to the samples, starting from a given model.
+    """Fit mean and basis to the samples of as many texels as fit in memory.
 
     Parameters
     ----------
     read : callable
         From texel indices to their `RootedSamples` in the aligned frames.
-    start : ClusteredModel
+    initial : ClusteredModel
         Clusters, coefficients, mean and basis to start from (grid fit).
     observed : (k,) int
         Texels that have samples.
@@ -119,42 +119,13 @@ def fit_samples(
     Returns
     -------
     ClusteredModel
-        With `residuals` of every round.
+        With `residuals` of every round. Coefficients of texels that did not shape the basis
+        are the initial ones; `solve_coefficients` finds them.
 
     Raises
     ------
     InputError
         If no texel is observed.
-    """
-    model = fit_basis(
-        read, start, observed, bytes_per_texel, options, workers=workers, seed=seed
-    )
-    coefficients = model.coefficients.copy()
-    step = max(64, options.max_bytes // bytes_per_texel // 2)
-    blocks = [observed[i : i + step] for i in range(0, len(observed), step)]
-    with ThreadPoolExecutor(workers) as pool:
-        for block in track(blocks, len(blocks), "coefficients of all texels"):
-            found, _ = solve_coefficients(
-                read(block), model.cluster[block], model, pool, bounded=True
-            )
-            coefficients[block] = found
-    return replace(model, coefficients=coefficients)
-
-
-def fit_basis(
-    read: Reader,
-    start: ClusteredModel,
-    observed: NDArray[np.intp],
-    bytes_per_texel: int,
-    options: SampleFitOptions,
-    *,
-    workers: int = 1,
-    seed: int = 0,
-) -> ClusteredModel:
-    """Fit mean and basis to the samples of as many texels as fit in memory.
-
-    Parameters, returns and errors as `fit_samples`; coefficients of other texels are those
-    that they were given.
     """
     if not len(observed):
         raise InputError("observed: expected texels with samples, received none")
@@ -162,7 +133,7 @@ def fit_basis(
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.choice(observed, min(n_chosen, len(observed)), replace=False))
     with ThreadPoolExecutor(workers) as pool:
-        return _alternate(read(chosen), start, chosen, options, pool)
+        return _alternate(read(chosen), initial, chosen, options, pool)
 
 
 def _alternate(
@@ -174,16 +145,16 @@ def _alternate(
 ) -> ClusteredModel:
     """Alternate between basis and coefficients of the chosen texels."""
     cluster = model.cluster[chosen]
-    for turn in range(options.rounds):
-        report("fitting the basis to the samples", turn, options.rounds)
+    for done in range(options.rounds):
+        report("fitting the basis to the samples", done, options.rounds)
         problem = BasisProblem(
             rooted, cluster, model.coefficients[chosen], options.smoothness, pool
         )
         model = replace(model, table=problem.solve(model.table, options.iterations))
-        found, squares = solve_coefficients(rooted, cluster, model, pool)
+        solved, squares = solve_coefficients(rooted, cluster, model, pool)
         noise = float(squares[:, 0].sum() / max(squares[:, 1].sum(), 1e-30))
         coefficients = model.coefficients.copy()
-        coefficients[chosen] = found
+        coefficients[chosen] = solved
         model = replace(
             model,
             coefficients=coefficients,

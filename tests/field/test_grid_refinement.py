@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from reflfield.errors import ShapeError
-from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.fineness import MOST_BYTES, finer_sides, on_finer_nodes
+from reflfield.field.clustered_model import (
+    MAX_TABLE_BYTES,
+    ClusteredModel,
+    on_refined_grid,
+    refined_sides,
+)
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 
@@ -36,7 +40,7 @@ def values(model, sides, directions):
 def test_functions_stay_where_old_nodes_are_new_ones(sides, finer, rng, rounding):
     model = model_on(rng, *sides)
     directions = HemisphereGrid(8).directions
-    found = on_finer_nodes(model, finer)
+    found = on_refined_grid(model, finer)
     assert found.table.dtype == np.float32
     np.testing.assert_allclose(
         values(found, finer, directions),
@@ -47,24 +51,24 @@ def test_functions_stay_where_old_nodes_are_new_ones(sides, finer, rng, rounding
 
 def test_the_same_sides_change_nothing(rng, rounding):
     model = model_on(rng, 5, 7)
-    found = on_finer_nodes(model, (5, 7))
+    found = on_refined_grid(model, (5, 7))
     np.testing.assert_allclose(found.table, model.table, atol=rounding(np.float32))
 
 
 def test_a_direction_that_does_not_vary_cannot_begin_to(rng):
     with pytest.raises(ShapeError, match="does not vary"):
-        on_finer_nodes(model_on(rng, 1, 5), (3, 9))
+        on_refined_grid(model_on(rng, 1, 5), (3, 9))
 
 
 @pytest.mark.parametrize("n_functions", [1, 56, 176, 10_000])
 @pytest.mark.parametrize("sides", [(7, 7), (11, 7), (13, 13), (1, 13), (1, 1), (6, 6)])
 def test_finer_sides_grow_alike_within_the_bytes(sides, n_functions):
-    view, light = finer_sides(sides, n_functions, 2.0)
+    view, light = refined_sides(sides, n_functions, 2.0)
     assert view >= sides[0]
     assert light >= sides[1]
     if (view, light) != sides:
-        assert 12 * n_functions * view**2 * light**2 <= MOST_BYTES
+        assert 12 * n_functions * view**2 * light**2 <= MAX_TABLE_BYTES
         for new, old in zip((view, light), sides, strict=True):
             assert new <= 2 * old - 1
             assert (new - old) % 2 == 0
-    assert finer_sides(sides, n_functions, 1.0) == sides
+    assert refined_sides(sides, n_functions, 1.0) == sides

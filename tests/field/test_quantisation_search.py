@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError
-from reflfield.field.building import Quantisation, build_field, quantisation_error
+from reflfield.field.build import Quantisation, build_field, quantisation_error
 from reflfield.field.file import PackedSizes, write_field
-from reflfield.field.rate import field_of_quality, field_of_size
+from reflfield.field.quantisation_search import field_of_quality, field_of_size
 
 
 @pytest.fixture
