@@ -52,7 +52,7 @@ class CompressionOptions:
     size : int
         Bytes that the file may have, 0: as many as `coarseness` gives. Clusters, components
         and quantisation are then chosen by the error that they leave; see
-        `field.quantisation_search`.
+        `field.step_search`.
     psnr : float
         LDR PSNR, dB, that the field is to have on the samples that it is made of, 0: as it
         comes. Clusters, components and quantisation are then chosen for the smallest file.

@@ -20,8 +20,8 @@ from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.file import PackedSizes
 from reflfield.field.observed_sphere import distinct_directions
-from reflfield.field.quantisation_search import field_of_quality, field_of_size
 from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.field.step_search import field_of_quality, field_of_size
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.image_projection import directions_of
 from reflfield.observations.texel_reading import TexelReader

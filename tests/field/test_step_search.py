@@ -6,7 +6,7 @@ import pytest
 from reflfield.errors import InputError
 from reflfield.field.build import Quantisation, build_field, quantisation_error
 from reflfield.field.file import PackedSizes, write_field
-from reflfield.field.quantisation_search import field_of_quality, field_of_size
+from reflfield.field.step_search import field_of_quality, field_of_size
 
 
 @pytest.fixture
