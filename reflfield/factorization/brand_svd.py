@@ -81,7 +81,7 @@ def model_of(svd: OnlineSVD, n_channels: int, noise: float) -> Model:
     covariance = floored(np.diag(svd.singular_values**2 / svd.n_columns))
     offset = np.zeros(len(basis), dtype=basis.dtype)
     rank = basis.shape[1]
-    model = Model(offset, basis, np.zeros(rank), covariance, noise, False, n_channels)
+    model = Model(offset, basis, np.zeros(rank), covariance, noise, n_channels)
     return model.quieted()
 
 

@@ -49,7 +49,6 @@ def cluster_columns(
     n_components: int,
     iterations: int,
     rng: np.random.Generator,
-    labels: NDArray[np.int32] | None = None,
 ) -> tuple[Clusters, tuple[float, ...]]:
     """Alternate between subspaces of clusters and nearest subspaces of points.
 
@@ -58,11 +57,9 @@ def cluster_columns(
     points : (n, d) float
         Of mean zero, leading principal components first.
     n_clusters, n_components, iterations : int
-        Iterations stop early when the error settles.
+        Iterations stop early when the error no longer falls.
     rng : numpy.random.Generator
         For the start.
-    labels : (n,) int32, optional
-        Start from these instead of k-means++.
 
     Returns
     -------
@@ -71,12 +68,8 @@ def cluster_columns(
     history : tuple of float
         Error relative to the points' own size after each iteration; never rises.
     """
-    if labels is None:
-        clusters = best_start(points, n_clusters, n_components, rng)
-        iterations = max(iterations, 1)
-    else:
-        clusters = updated(points, labels, n_clusters, n_components)
-    clusters, errors = alternate(points, clusters, iterations)
+    initial = best_start(points, n_clusters, n_components, rng)
+    clusters, errors = alternate(points, initial, iterations)
     size = max(float((points.astype(np.float64) ** 2).sum()), 1e-300)
     return clusters, tuple(float(np.sqrt(error / size)) for error in errors)
 
@@ -95,15 +88,15 @@ def alternate(
         labels, squared = nearest(points, clusters)
         errors.append(float(squared.sum()))
         labels = without_empty(labels, squared, n_clusters)
-        settled = np.array_equal(labels, clusters.labels) or _settled(errors)
+        converged = np.array_equal(labels, clusters.labels) or _converged(errors)
         clusters = updated(points, labels, n_clusters, n_components)
-        if settled:
+        if converged:
             break
     report("local PCA", iterations, iterations)
     return clusters, errors
 
 
-def _settled(errors: list[float]) -> bool:
+def _converged(errors: list[float]) -> bool:
     return len(errors) > 1 and errors[-1] >= (1 - LEAST_PROGRESS) * errors[-2]
 
 

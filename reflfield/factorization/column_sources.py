@@ -1,4 +1,4 @@
-"""Where columns come from: arrays, stores on disk, blocks; read a few columns at a time.
+"""Where columns come from: arrays and stores on disk; read a few columns at a time.
 
 Every method of this package reads its matrix through `ColumnSource`, so that
 memory holds a block of columns and never the matrix. `as_source` wraps what
@@ -7,10 +7,8 @@ callers usually have.
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -83,7 +81,7 @@ LEAST_COVERAGE = 0.02
 
 
 @dataclass(frozen=True)
-class ArraySource:
+class MatrixSource:
     """Columns of an array, memory map or zarr array, with or without `observed` beside it.
 
     Without `observed`, NaN marks what is missing.
@@ -131,133 +129,14 @@ def take_columns(array: Any, columns: Columns) -> NDArray[Any]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
-@dataclass
-class BlockSource:
-    """Columns of a sequence of blocks, each (n_rows, k) or a pair (values, observed).
-
-    The sequence is indexed when a column of a block is asked for, so it may
-    load its blocks lazily; all are looked at once to learn their widths.
-    """
-
-    blocks: Sequence[Any]
-    n_channels: int = 1
-    _edges: list[int] = field(init=False, repr=False)
-    _n_rows: int = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        shapes = [np.shape(_values_of(block)) for block in self.blocks]
-        self._n_rows, self._edges = _check_widths(shapes)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns over all blocks."""
-        return self._n_rows, self._edges[-1]
-
-    @property
-    def dtype(self) -> DTypeLike:
-        """Type of the values of the first block."""
-        return np.asarray(_values_of(self.blocks[0])).dtype
-
-    @property
-    def run_length(self) -> int:
-        """Width of the widest block."""
-        return max(b - a for a, b in pairwise(self._edges))
-
-    def read(self, columns: Columns) -> tuple[Values, Weights]:
-        """Values and weights of some columns, gathered block by block."""
-        owner = np.array([bisect_right(self._edges, column) - 1 for column in columns])
-        breaks = np.flatnonzero(np.diff(owner)) + 1
-        parts = [
-            _read_block(self.blocks[owner[i[0]]], columns[i] - self._edges[owner[i[0]]],
-                        self.n_channels)
-            for i in np.split(np.arange(len(columns)), breaks)
-        ]  # fmt: skip
-        return (
-            np.concatenate([values for values, _ in parts], axis=1),
-            np.concatenate([weights for _, weights in parts], axis=1),
-        )
-
-
-class StreamSource:
-    """Columns of a function that returns a fresh iterator of blocks at every call.
-
-    Read in order, one pass costs one iteration; asking backwards starts anew.
-    The blocks are iterated over once to count the columns.
-    """
-
-    def __init__(self, make_blocks: Callable[[], Iterable[Any]], n_channels: int = 1) -> None:
-        self._make_blocks = make_blocks
-        self._n_channels = n_channels
-        shapes = [np.shape(_values_of(block)) for block in make_blocks()]
-        self._n_rows, self._edges = _check_widths(shapes)
-        self.run_length = self._edges[-1]
-        self._rewind()
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns over all blocks."""
-        return self._n_rows, self._edges[-1]
-
-    def _rewind(self) -> None:
-        self._blocks = iter(self._make_blocks())
-        self._position = -1
-        self._block: Any = None
-
-    def _load(self, position: int) -> Any:
-        if position < self._position:
-            self._rewind()
-        while self._position < position:
-            self._block = next(self._blocks)
-            self._position += 1
-        return self._block
-
-    def read(self, columns: Columns) -> tuple[Values, Weights]:
-        """Values and weights of some columns, read off the stream in ascending order."""
-        ascending = np.argsort(columns, kind="stable")
-        parts = []
-        for position in np.unique(np.searchsorted(self._edges, columns, "right") - 1):
-            first, end = self._edges[position], self._edges[position + 1]
-            inside = columns[ascending]
-            inside = inside[(inside >= first) & (inside < end)]
-            parts.append(_read_block(self._load(position), inside - first, self._n_channels))
-        restore = np.argsort(ascending, kind="stable")
-        values = np.concatenate([values for values, _ in parts], axis=1)
-        weights = np.concatenate([weights for _, weights in parts], axis=1)
-        return values[:, restore], weights[:, restore]
-
-
-def _values_of(block: Any) -> Any:
-    return block[0] if isinstance(block, tuple) else block
-
-
-def _read_block(block: Any, columns: Columns, n_channels: int) -> tuple[Values, Weights]:
-    observed = np.asarray(block[1]) if isinstance(block, tuple) else None
-    return ArraySource(np.asarray(_values_of(block)), observed, n_channels).read(columns)
-
-
-def _check_widths(shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[int]]:
-    """Rows and the column at which each block starts; all blocks have the same rows."""
-    if not shapes:
-        raise InputError("matrix: expected at least one block of columns, received none")
-    for i, shape in enumerate(shapes):
-        if len(shape) != 2 or shape[0] != shapes[0][0]:
-            raise ShapeError(
-                f"matrix: expected blocks of shape ({shapes[0][0]}, k), "
-                f"received {shape} as block {i}"
-            )
-    return shapes[0][0], [0, *np.cumsum([shape[1] for shape in shapes]).tolist()]
-
-
 def as_source(
     matrix: Any, observed: Any = None, weights: Any = None, n_channels: int = 1
 ) -> ColumnSource:
-    """Wrap a matrix, store, list of blocks or function of blocks as a column source.
+    """Wrap a matrix or store as a column source; a source stays as it is.
 
     Parameters
     ----------
-    matrix : (n_rows, n_columns) array_like, zarr array, ColumnSource, sequence or callable
-        A sequence holds blocks (n_rows, k) or pairs (values, observed); a
-        callable returns an iterator of such blocks, a fresh one at each call.
+    matrix : (n_rows, n_columns) ndarray, zarr array or ColumnSource
     observed : (n_rows // n_channels, n_columns) bool, optional
         True where the entry was measured. Without it, NaN marks what is missing.
     weights : (n_rows // n_channels, n_columns) float in [0, 1], optional
@@ -304,28 +183,16 @@ def as_source(
 
 
 def _wrap(matrix: Any, beside: Any, n_channels: int) -> ColumnSource:
-    if hasattr(matrix, "shape"):
-        if len(matrix.shape) != 2:
-            raise ShapeError(
-                f"matrix: expected shape (n_rows, n_columns), received {matrix.shape}"
-            )
-        is_source = hasattr(matrix, "read") and not isinstance(matrix, np.ndarray)
-    else:
-        is_source = False
-    if beside is not None and (is_source or not hasattr(matrix, "shape")):
+    if not hasattr(matrix, "shape") or len(matrix.shape) != 2:
+        received = getattr(matrix, "shape", type(matrix).__name__)
+        raise ShapeError(f"matrix: expected shape (n_rows, n_columns), received {received}")
+    if isinstance(matrix, np.ndarray) or not hasattr(matrix, "read"):
+        return MatrixSource(matrix, beside, n_channels)
+    if beside is not None:
         raise InputError(
-            "observed: expected None with a source or blocks, which bring their own; "
-            "return pairs (values, observed)"
+            "observed: expected None with a source, which returns weights beside its values"
         )
-    if is_source:
-        return matrix
-    if hasattr(matrix, "shape"):
-        return ArraySource(matrix, beside, n_channels)
-    return (
-        StreamSource(matrix, n_channels)
-        if callable(matrix)
-        else BlockSource(matrix, n_channels)
-    )
+    return matrix
 
 
 # --- one block, ready for arithmetic ----------------------------------------------------

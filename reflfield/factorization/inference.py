@@ -68,8 +68,7 @@ def infer_coefficients(
         # Directions that no column used get a prior too: few rows would not determine them.
         prior_covariance=floored(used.T @ used / max(len(used), 1)),
         noise=float(max((completion.noise / scale) ** 2, 1e-30)),
-        centred=False,
         n_channels=n_channels,
     )
-    coefficients, coverage, _ = map_coefficients(reader, model.quieted(), block)
+    coefficients, coverage = map_coefficients(reader, model.quieted(), block)
     return (coefficients * scale).astype(np.float32), coverage

@@ -47,7 +47,6 @@ def start_model(
     order: Columns,
     rank: int,
     block: int,
-    centred: bool,
     rng: np.random.Generator,
 ) -> tuple[Model, float]:
     """Model of the block that is fitted best, and the noise variance left in it.
@@ -60,8 +59,6 @@ def start_model(
         Columns in the order in which they will be visited.
     rank, block : int
         Basis vectors; columns of a block.
-    centred : bool
-        True if an offset is fitted too.
     rng : numpy.random.Generator
         For the choice of rows and the first subspace.
 
@@ -82,7 +79,7 @@ def start_model(
     best: tuple[float, Model, Posterior, Block] | None = None
     for trial, data in enumerate(_informative_blocks(reader, order, block)):
         part = rows_of(data, samples, reader.n_channels)
-        model = _first_model(part, rank, reader.n_channels, centred, rng, trial)
+        model = _first_model(part, rank, reader.n_channels, rng, trial)
         fitted = _turns(model, part)
         if best is None or fitted[0] < best[0]:
             best = (*fitted, data)
@@ -163,16 +160,12 @@ def _first_model(
     data: Block,
     rank: int,
     n_channels: int,
-    centred: bool,
     rng: np.random.Generator,
     trial: int,
 ) -> Model:
-    """Randomised SVD of a block with zeros (or row means) where nothing was observed."""
+    """Randomised SVD of a block with zeros where nothing was observed."""
     weights = np.repeat(data.weights, n_channels, axis=0)
-    offset = np.zeros(len(weights), dtype=weights.dtype)
-    if centred:
-        offset = (data.values * weights).sum(axis=1) / np.maximum(weights.sum(axis=1), 1e-30)
-    filled = weighted(data.values - offset[:, None], data.weights, n_channels)
+    filled = weighted(data.values, data.weights, n_channels)
     if trial > 0:
         # Another beginning on what may be the same block.
         filled = filled * (0.5 + rng.random((filled.shape[1],))).astype(filled.dtype)
@@ -181,7 +174,8 @@ def _first_model(
     variance = (values.astype(np.float64) / share) ** 2 / filled.shape[1]
     power = float((filled.astype(np.float64) ** 2).sum()) / float(weights.sum())
     prior = floored(np.diag(variance))
-    model = Model(offset, basis, np.zeros(rank), prior, 0.1 * power, centred, n_channels)
+    offset = np.zeros(len(weights), dtype=weights.dtype)
+    model = Model(offset, basis, np.zeros(rank), prior, 0.1 * power, n_channels)
     return model.quieted()
 
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from reflfield.errors import InputError, ShapeError
-from reflfield.factorization.packed_matrices import outer_products, unpack
+from reflfield.errors import InputError
 from reflfield.util.validation import check_shape
 
 Array = NDArray[Any]
@@ -17,8 +16,6 @@ THRESHOLD = {np.dtype(np.float32): 3e-6, np.dtype(np.float64): 1e-13}
 # Blocks are folded in parts of at least so many columns: the cost of a column grows with the
 # width of its part, and matrix products are efficient from about here on.
 SMALL_BLOCK = 64
-# Lambda of the filling; U_o^T U_o has its eigenvalues in [0, 1].
-FILLING_RIDGE = 1e-6
 
 
 def fixed_signs(vectors: Array) -> Array:
@@ -43,15 +40,11 @@ class OnlineSVD:
         Singular vectors kept.
     dtype : float32 or float64
         Precision of the basis; small matrices are always float64.
-    mean : bool
-        True: the SVD is that of the columns about their running mean.
 
     Attributes
     ----------
     n_columns : int
         Columns seen.
-    mean : (n_rows,) float
-        Running mean; zero unless asked for.
 
     Raises
     ------
@@ -61,15 +54,12 @@ class OnlineSVD:
     Notes
     -----
     Cost per block of k columns is O(n_rows (rank + k)^2), memory O(n_rows (rank + k)).
-    The mean follows the incremental PCA of Ross et al. [2]_. The batch form is a loop
-    over `update`; there is no other.
+    The batch form is a loop over `update`; there is no other.
 
     References
     ----------
     .. [1] M. Brand, "Incremental singular value decomposition of uncertain data with
        missing values", ECCV 2002.
-    .. [2] D. Ross, J. Lim, R. Lin, M. Yang, "Incremental learning for robust visual
-       tracking", IJCV 77, 2008.
 
     Examples
     --------
@@ -78,7 +68,7 @@ class OnlineSVD:
     (array([5.]), array([0.6, 0.8]))
     """
 
-    def __init__(self, rank: int, dtype: DTypeLike = np.float32, *, mean: bool = False) -> None:
+    def __init__(self, rank: int, dtype: DTypeLike = np.float32) -> None:
         if rank < 1:
             raise InputError(f"rank: expected at least 1, received {rank}")
         self.rank = rank
@@ -86,10 +76,8 @@ class OnlineSVD:
         if self.dtype not in THRESHOLD:
             raise InputError(f"dtype: expected float32 or float64, received {self.dtype}")
         self.n_columns = 0
-        self._centred = mean
         self._basis: Array | None = None
         self._values = np.zeros(0)
-        self._mean = np.zeros(0)
         self._largest_norm = 0.0
 
     # --- results ---
@@ -105,18 +93,6 @@ class OnlineSVD:
         """Singular values, descending, (k,)."""
         return self._values.copy()
 
-    @property
-    def mean(self) -> Array:
-        """Running mean of the columns, (n_rows,); zero unless asked for."""
-        self._started()
-        return self._mean.astype(self.dtype)
-
-    def project(self, block: Array) -> Array:
-        """Coefficients of columns (n_rows, n) in the basis, (n, k)."""
-        basis = self.basis
-        check_shape("block", block, (len(basis), None))
-        return (block.astype(self.dtype, copy=False) - self.mean[:, None]).T @ basis
-
     def _started(self) -> Array:
         if self._basis is None:
             raise InputError("OnlineSVD: expected a block of columns first; call update")
@@ -124,18 +100,12 @@ class OnlineSVD:
 
     # --- update ---
 
-    def update(self, block: Array, observed: Array | None = None) -> OnlineSVD:
-        r"""Fold a block of columns into the SVD.
+    def update(self, block: Array) -> OnlineSVD:
+        """Fold a block of columns into the SVD.
 
         Parameters
         ----------
         block : (n_rows, n_new) float
-            Values where `observed` is False are never used and may be NaN.
-        observed : (n_rows, n_new) bool, optional
-            True where the entry was measured. What was not is first filled from the
-            current basis, :math:`\hat c = U (U_o^\top U_o + \lambda I)^{-1} U_o^\top c_o`,
-            then counted as data: good for gaps at random, a baseline only for gaps
-            shaped like occlusion (use `complete`).
 
         Returns
         -------
@@ -145,72 +115,24 @@ class OnlineSVD:
         Raises
         ------
         ShapeError
-            If shapes do not fit each other or earlier blocks.
+            If the rows are not those of earlier blocks.
         InputError
-            If an observed value is not finite.
+            If a value is not finite.
         """
-        columns = self._checked(block, observed)
-        for start in range(0, columns.shape[1], max(SMALL_BLOCK, self.rank)):
-            part = slice(start, start + max(SMALL_BLOCK, self.rank))
-            self._update(columns[:, part], None if observed is None else observed[:, part])
-        return self
-
-    def _update(self, columns: Array, observed: Array | None) -> None:
-        n_new = columns.shape[1]
-        if observed is not None:
-            columns = self._filled(columns, observed)
-        self._fold(self._centre(columns) if self._centred else columns)
-        self.n_columns += n_new
-
-    def _checked(self, block: Array, observed: Array | None) -> Array:
-        n_rows = None if self._basis is None else len(self._basis)
-        check_shape("block", block, (n_rows, None))
-        if observed is not None:
-            if observed.shape != block.shape:
-                raise ShapeError(
-                    f"observed: expected shape {block.shape} like block, "
-                    f"received {observed.shape}"
-                )
-            block = np.where(observed, block, 0)
+        check_shape("block", block, (None if self._basis is None else len(self._basis), None))
         if not np.isfinite(block).all():
-            raise InputError(
-                "block: expected finite values where observed, received NaN or inf"
-            )
-        return block.astype(self.dtype, copy=False)
-
-    def _filled(self, columns: Array, observed: Array) -> Array:
-        """Predict unobserved entries: by the basis, in the first block by row means."""
-        if self._basis is None or self._basis.shape[1] == 0:
-            n_observed = np.maximum(observed.sum(axis=1), 1)
-            return np.where(observed, columns, (columns.sum(axis=1) / n_observed)[:, None])
-        basis, rank = self._basis, self._basis.shape[1]
-        mean = self._mean.astype(self.dtype)[:, None]
-        seen = observed.astype(self.dtype)
-        gram = unpack((seen.T @ outer_products(basis)).astype(np.float64), rank)
-        right = (seen * (columns - mean)).T @ basis
-        left = gram + FILLING_RIDGE * np.eye(rank)
-        coefficients = np.linalg.solve(left, right[:, :, None].astype(np.float64))[:, :, 0]
-        expected = mean + basis @ coefficients.T.astype(self.dtype)
-        return np.where(observed, columns, expected)
-
-    def _centre(self, columns: Array) -> Array:
-        """Columns about their own mean, and one for the shift of the running mean."""
-        n_new = columns.shape[1]
-        block_mean = columns.mean(axis=1, dtype=np.float64)
-        if self._basis is None:
-            self._mean = np.zeros(len(columns))
-        total = self.n_columns + n_new
-        shift = np.sqrt(self.n_columns * n_new / total) * (self._mean - block_mean)
-        self._mean = self._mean + (block_mean - self._mean) * (n_new / total)
-        centred = columns - block_mean.astype(self.dtype)[:, None]
-        return np.column_stack([centred, shift.astype(self.dtype)])
+            raise InputError("block: expected finite values, received NaN or inf")
+        columns = block.astype(self.dtype, copy=False)
+        for start in range(0, columns.shape[1], max(SMALL_BLOCK, self.rank)):
+            part = columns[:, start : start + max(SMALL_BLOCK, self.rank)]
+            self._fold(part)
+            self.n_columns += part.shape[1]
+        return self
 
     def _fold(self, columns: Array) -> None:
         """Append columns to U S and truncate."""
         if self._basis is None:
             self._basis = np.zeros((len(columns), 0), dtype=self.dtype)
-            if not self._centred:
-                self._mean = np.zeros(len(columns))
         norms = column_norms(columns)
         self._largest_norm = max(self._largest_norm, float(norms.max()))
         if self._largest_norm == 0.0:
@@ -245,7 +167,7 @@ def column_norms(columns: Array) -> Array:
 
 
 def outside(basis: Array, columns: Array) -> Array:
-    """What of the columns the basis does not hold, projected out twice."""
+    """Components of the columns orthogonal to the basis; projected twice."""
     rest = columns - basis @ (basis.T @ columns)
     return rest - basis @ (basis.T @ rest)
 

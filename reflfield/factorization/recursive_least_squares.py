@@ -35,15 +35,13 @@ class Model:
     Attributes
     ----------
     offset : (n_rows,) float
-        m; all zero unless the model is centred.
+        m, a fixed column that is subtracted; zero while a basis is fitted.
     basis : (n_rows, r) float
         U.
     prior_mean, prior_covariance : (r,), (r, r) float64
         mu and C.
     noise : float
         nu, the variance of an entry of weight 1.
-    centred : bool
-        True if m is estimated along with U.
     n_channels : int
         Adjacent rows that share one weight.
     """
@@ -53,7 +51,6 @@ class Model:
     prior_mean: Array
     prior_covariance: Array
     noise: float
-    centred: bool
     n_channels: int
 
     @property
@@ -154,13 +151,12 @@ def squared_residual(residual: Array, weights: Array, n_channels: int) -> Array:
 class RowStatistics:
     """Sums from which the rows of the basis are solved: G, B and the moments of z.
 
-    Memory is n_samples q (q + 1) / 2 + n_rows q float64 with q = rank (+ 1 if
-    centred): 42 MB for 22,801 samples x 3 channels at rank 16.
+    Memory is n_samples r (r + 1) / 2 + n_rows r float64 with r = rank: 34 MB for 22,801
+    samples x 3 channels at rank 16.
     """
 
     def __init__(self, model: Model) -> None:
-        self.width = model.rank + int(model.centred)
-        self.centred = model.centred
+        self.width = model.rank
         self.n_channels = model.n_channels
         n_rows = len(model.basis)
         self.gram = np.zeros((n_rows // model.n_channels, packed_size(self.width)))
@@ -175,8 +171,10 @@ class RowStatistics:
     def add(self, block: Block, posterior: Posterior, counted: NDArray[np.bool_]) -> None:
         """Sum a block in; columns where `counted` is False leave no trace."""
         dtype = block.values.dtype
-        vectors = self._augmented(posterior.mean) * counted[:, None]
-        second = self._second(vectors, posterior.covariance) * counted[:, None, None]
+        vectors = posterior.mean * counted[:, None]
+        # E[z z^T] of every column.
+        second = vectors[:, :, None] * vectors[:, None, :] + posterior.covariance
+        second *= counted[:, None, None]
         self.gram += block.weights @ pack(second).astype(dtype)
         values = weighted(block.values, block.weights, self.n_channels)
         self.cross += values @ vectors.astype(dtype)
@@ -193,20 +191,9 @@ class RowStatistics:
         weight = block.weights.sum(axis=0, dtype=np.float64)[counted].sum()
         self.weight += float(weight) * self.n_channels
 
-    def _augmented(self, mean: Array) -> Array:
-        """Coefficients with a leading 1 that multiplies the offset, if there is one."""
-        return np.insert(mean, 0, 1.0, axis=1) if self.centred else mean
-
-    def _second(self, vectors: Array, covariance: Array) -> Array:
-        """E[z z^T] of every column."""
-        second = vectors[:, :, None] * vectors[:, None, :]
-        first = int(self.centred)
-        second[:, first:, first:] += covariance
-        return second
-
     @property
     def mean_second_moment(self) -> Array:
-        """E[z z^T] over the columns so far, (q, q)."""
+        """E[z z^T] over the columns so far, (r, r)."""
         return self.second_moment / self.count
 
     @property
@@ -220,13 +207,13 @@ class RowStatistics:
         return (self.squared_residual + self.spread) / self.weight
 
     def solve_rows(self, prior_rows: Array, strength: Array) -> Array:
-        """u_i = (G_i + strength)^-1 (b_i + strength u_i0) for every row, (n_rows, q) float64.
+        """u_i = (G_i + strength)^-1 (b_i + strength u_i0) for every row, (n_rows, r) float64.
 
         Parameters
         ----------
-        prior_rows : (n_rows, q) float
+        prior_rows : (n_rows, r) float
             u_i0, what a row falls back to.
-        strength : (q, q) float64
+        strength : (r, r) float64
             Positive definite; pseudo-observations of u_i0.
         """
         n_samples = len(self.gram)
@@ -244,26 +231,10 @@ class RowStatistics:
 # --- passes -----------------------------------------------------------------------------
 
 
-def split_rows(model: Model, rows: Array) -> tuple[Array, Array]:
-    """Offset and basis from solved rows."""
-    if model.centred:
-        return rows[:, 0], rows[:, 1:]
-    return np.zeros(len(rows)), rows
-
-
-def join_rows(model: Model) -> Array:
-    """Rows as they are solved: the offset, if estimated, leads."""
-    if model.centred:
-        return np.column_stack([model.offset, model.basis])
-    return model.basis
-
-
 def with_moments(model: Model, statistics: RowStatistics) -> Model:
     """The model with mu, C and nu from the sums."""
-    first = int(statistics.centred)
-    mean = statistics.first_moment[first:] / statistics.count
-    second = statistics.mean_second_moment[first:, first:]
-    covariance = floored(second - np.outer(mean, mean))
+    mean = statistics.first_moment / statistics.count
+    covariance = floored(statistics.mean_second_moment - np.outer(mean, mean))
     noise = statistics.noise
     return replace(model, prior_mean=mean, prior_covariance=covariance, noise=noise).quieted()
 
@@ -280,9 +251,8 @@ def floored(covariance: Array) -> Array:
 def resolve_online(model: Model, statistics: RowStatistics, pseudo: float) -> Model:
     """Rows solved with `pseudo` observations of what they were; coordinates unchanged."""
     strength = pseudo * regular(statistics.mean_second_moment)
-    offset, basis = split_rows(model, statistics.solve_rows(join_rows(model), strength))
-    dtype = model.basis.dtype
-    return replace(model, offset=offset.astype(dtype), basis=basis.astype(dtype))
+    basis = statistics.solve_rows(model.basis, strength)
+    return replace(model, basis=basis.astype(model.basis.dtype))
 
 
 def resolve_final(model: Model, statistics: RowStatistics) -> Model:
@@ -295,15 +265,7 @@ def resolve_final(model: Model, statistics: RowStatistics) -> Model:
     tiny = 1e-12 * np.trace(statistics.second_moment) / statistics.width
     strength = (model.noise / size + tiny) * np.eye(statistics.width)
     rows = statistics.solve_rows(np.zeros_like(statistics.cross), strength)
-    return orthonormal(model, *split_rows(model, rows))
-
-
-def resolve_towards(model: Model, statistics: RowStatistics, pseudo: float) -> Model:
-    """Rows solved with `pseudo` observations of what they were; basis orthonormal."""
-    strength = pseudo * regular(statistics.mean_second_moment)
-    return orthonormal(
-        model, *split_rows(model, statistics.solve_rows(join_rows(model), strength))
-    )
+    return orthonormal(model, rows)
 
 
 def regular(matrix: Array) -> Array:
@@ -311,14 +273,11 @@ def regular(matrix: Array) -> Array:
     return matrix + (1e-9 * np.trace(matrix) / len(matrix) + 1e-300) * np.eye(len(matrix))
 
 
-def orthonormal(model: Model, offset: Array, basis: Array) -> Model:
+def orthonormal(model: Model, basis: Array) -> Model:
     """Same model in coordinates where U^T U = I and E[z z^T] is diagonal, descending."""
     if model.rank == 0:
-        return replace(model, offset=offset.astype(model.offset.dtype))
+        return model
     q, r = np.linalg.qr(basis)
-    if model.centred:
-        offset = offset + basis @ model.prior_mean
-        model = replace(model, prior_mean=np.zeros(model.rank))
     mean = r @ model.prior_mean
     covariance = r @ model.prior_covariance @ r.T
     values, vectors = np.linalg.eigh(covariance + np.outer(mean, mean))
@@ -328,7 +287,6 @@ def orthonormal(model: Model, offset: Array, basis: Array) -> Model:
     vectors = vectors * signs
     return replace(
         model,
-        offset=offset.astype(model.offset.dtype),
         basis=(basis * signs).astype(model.basis.dtype),
         prior_mean=vectors.T @ mean,
         prior_covariance=floored(vectors.T @ covariance @ vectors),

@@ -62,16 +62,13 @@ class Completion:
         Root mean square over the observed entries in each pass, with the
         basis that the pass began with.
     coverage : (n_columns,) float32
-        Observed share of each column (mean of the weights).
-    empty_columns : (n_columns,) bool
-        True where nothing was observed; such a column equals `mean`.
+        Observed share of each column (mean of the weights). A column of which nothing was
+        observed equals `mean`; a row of which nothing was, is zero.
     sparse_columns : (n_columns,) bool
         True where less than 2 % was observed (empty ones included); these
         were completed but did not shape basis, mean and noise.
-    empty_rows : (n_rows,) bool
-        True where no column was observed; such a row is zero.
     restarts : int
-        Column orders tried and given up before this fit.
+        Column orders tried and abandoned before this fit.
     """
 
     basis: NDArray[np.floating]
@@ -80,34 +77,13 @@ class Completion:
     noise: float
     residuals: tuple[float, ...]
     coverage: NDArray[np.float32]
-    empty_columns: NDArray[np.bool_]
     sparse_columns: NDArray[np.bool_]
-    empty_rows: NDArray[np.bool_]
     restarts: int = 0
 
     @property
     def rank(self) -> int:
         """Columns of the basis."""
         return int(self.basis.shape[1])
-
-    def reconstruct(
-        self, columns: slice | int | NDArray[np.integer] | None = None
-    ) -> NDArray[np.floating]:
-        """Columns of the completed matrix, (n_rows, k).
-
-        Parameters
-        ----------
-        columns : slice, int or index array, optional
-            All columns by default.
-
-        Returns
-        -------
-        (n_rows, k) float
-            One integer gives one column, k = 1.
-        """
-        chosen = slice(None) if columns is None else columns
-        coefficients = np.atleast_2d(self.coefficients[chosen])
-        return self.mean[:, None] + self.basis @ coefficients.T
 
 
 def complete(
@@ -119,7 +95,6 @@ def complete(
     method: Literal["map", "brand"] = "map",
     weights: Any = None,
     n_channels: int = 1,
-    centred: bool = False,
     block: int = 256,
     restarts: int = 1,
     seed: int = 0,
@@ -142,7 +117,7 @@ def complete(
 
     Parameters
     ----------
-    matrix : (n_rows, n_columns) array_like, zarr array, ColumnSource, sequence or callable
+    matrix : (n_rows, n_columns) array_like, zarr array or ColumnSource
         See `as_source`. float64 is computed in float64, all else in float32.
     observed : (n_rows // n_channels, n_columns) bool, optional
         True where the entry was measured. Without it, NaN marks what is missing.
@@ -155,8 +130,6 @@ def complete(
         Confidence, in place of `observed`: noise variance is noise^2 / weight.
     n_channels : int
         Rows that share one observation, adjacent (channel fastest).
-    centred : bool
-        True: a mean column is fitted beside the `rank` basis vectors.
     block : int
         Columns held in memory at once. For a source with a ``run_length``, a multiple of
         it: a chunk is then read once a pass.
@@ -197,7 +170,8 @@ def complete(
     >>> truth = np.outer([1.0, 2.0, 2.0], [3.0, 1.0, 4.0])
     >>> holed = truth.copy()
     >>> holed[2, 1] = np.nan
-    >>> complete(holed, rank=1).reconstruct(1).round(2).ravel()
+    >>> fit = complete(holed, rank=1)
+    >>> (fit.mean + fit.basis @ fit.coefficients[1]).round(2)
     array([1., 2., 2.])
     """
     _check_options(rank=rank, passes=passes, block=block)
@@ -209,7 +183,7 @@ def complete(
     if method == "brand":
         fit = fit_brand(reader, rank, passes, block)
         return _finish(reader, fit, block, 0)
-    fit, attempts = _fit_restarting(reader, rank, passes, block, centred, restarts, seed)
+    fit, attempts = _fit_restarting(reader, rank, passes, block, restarts, seed)
     return _finish(reader, fit, block, attempts)
 
 
@@ -224,7 +198,6 @@ def fit_map(
     rank: int,
     passes: int,
     block: int,
-    centred: bool,
     rng: np.random.Generator,
     rival: float = np.inf,
 ) -> Fit:
@@ -234,7 +207,7 @@ def fit_map(
     A fit whose first residual is not below `rival` is given up after that pass.
     """
     order = shuffled_columns(reader.source, rng)
-    model, floor = start_model(reader, order, rank, block, centred, rng)
+    model, floor = start_model(reader, order, rank, block, rng)
     residuals: list[float] = []
     for number in range(passes):
         online = number < max(1, passes // 2)
@@ -257,16 +230,16 @@ def _is_stalled(residuals: list[float], variance: float, floor: float) -> bool:
 
 
 def _fit_restarting(
-    reader: Reader, rank: int, passes: int, block: int, centred: bool, restarts: int, seed: int
+    reader: Reader, rank: int, passes: int, block: int, restarts: int, seed: int
 ) -> tuple[Fit, int]:
     """Best of several column orders; the next is tried only if the fit stalls."""
-    best = fit_map(reader, rank, passes, block, centred, np.random.default_rng([seed, 0]))
+    best = fit_map(reader, rank, passes, block, np.random.default_rng([seed, 0]))
     attempt = 0
     while best.stalled and attempt < restarts:
         attempt += 1
         rng = np.random.default_rng([seed, attempt])
         rival = 0.9 * best.residuals[0]
-        fit = fit_map(reader, rank, passes, block, centred, rng, rival)
+        fit = fit_map(reader, rank, passes, block, rng, rival)
         if len(fit.residuals) == passes and fit.residuals[-1] < best.residuals[-1]:
             best = fit
     return best, attempt
@@ -299,25 +272,23 @@ def one_pass(
 
 def map_coefficients(
     reader: Reader, model: Model, block: int
-) -> tuple[NDArray[np.floating], NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients about the prior mean, coverage of columns, and total weight of samples."""
-    n_rows, n_columns = reader.source.shape
+) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+    """Coefficients about the prior mean, and coverage of columns."""
+    n_columns = reader.source.shape[1]
     coefficients = np.zeros((n_columns, model.rank), dtype=reader.dtype)
     coverage = np.zeros(n_columns)
-    sample_weight = np.zeros(n_rows // model.n_channels)
     gram = gram_of_samples(model.basis, model.n_channels)
     for columns in blocks_of(np.arange(n_columns), block):
         data = reader.block(columns)
         coefficients[columns] = infer(model, data, gram).mean - model.prior_mean
         coverage[columns] = data.coverage
-        sample_weight += data.weights.sum(axis=1)
-    return coefficients, coverage, sample_weight
+    return coefficients, coverage
 
 
 def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
     """Read all columns once more for coefficients and flags; back to the caller's unit."""
     model, scale, dtype = fit.model, reader.scale, reader.dtype
-    coefficients, coverage, sample_weight = map_coefficients(reader, model, block)
+    coefficients, coverage = map_coefficients(reader, model, block)
     mean = model.offset + model.basis @ model.prior_mean
     return Completion(
         basis=model.basis,
@@ -326,8 +297,6 @@ def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
         noise=float(np.sqrt(model.noise) * scale),
         residuals=tuple(residual * scale for residual in fit.residuals),
         coverage=coverage.astype(np.float32),
-        empty_columns=coverage == 0,
         sparse_columns=coverage < reader.least_coverage,
-        empty_rows=np.repeat(sample_weight == 0, model.n_channels),
         restarts=restarts,
     )

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.errors import InputError
 from reflfield.factorization.column_sources import Reader, blocks_of
-from reflfield.factorization.svd_completion import fit_map, map_coefficients
 from reflfield.util.progress import report
 
 Array = NDArray[Any]
-# Random directions beyond those wanted; Halko, Martinsson, Tropp, SIAM Review 53, 2011.
+# Random directions beyond those wanted.
 OVERSAMPLING = 10
-COMPLETION_PASSES = 3
 
 
 @dataclass(frozen=True)
@@ -29,47 +28,49 @@ class Workspace:
         Orthonormal, by descending variance of the coordinates.
     coordinates : (n_columns, d) float
         Of mean zero.
-    noise : float
-        Variance of what is left, per entry.
     """
 
     mean: Array
     basis: Array
     coordinates: Array
-    noise: float
 
 
-def pca_workspace(reader: Reader, n_dimensions: int, block: int, seed: int) -> Workspace | None:
+def pca_workspace(reader: Reader, n_dimensions: int, block: int, seed: int) -> Workspace:
     """Leading principal components by randomised subspace iteration, in three readings.
 
-    Returns None as soon as an entry is found that was not fully observed.
+    N. Halko, P. Martinsson, J. Tropp, "Finding structure with randomness", SIAM Review 53,
+    2011.
+
+    Raises
+    ------
+    InputError
+        If an entry is missing.
     """
     n_rows, n_columns = reader.source.shape
     n_dimensions = min(n_dimensions, n_rows, n_columns)
     width = min(n_dimensions + OVERSAMPLING, n_rows, n_columns)
     probes = np.random.default_rng(seed).standard_normal((n_columns, width), dtype=np.float32)
-    found = _sketch(reader, probes, block)
-    if found is None:
-        return None
-    mean, sketch = found
+    mean, sketch = _sketch(reader, probes, block)
     sketch, _ = _power_step(reader, mean, np.linalg.qr(sketch)[0], block)
     q = np.linalg.qr(sketch)[0]
     _, coordinates = _power_step(reader, mean, q, block)
-    _, values, vectors = np.linalg.svd(coordinates, full_matrices=False)
+    _, _, vectors = np.linalg.svd(coordinates, full_matrices=False)
     rotation = vectors[:n_dimensions].T
-    noise = float((values[n_dimensions:] ** 2).sum()) / (n_rows * n_columns)
-    return Workspace(mean, q @ rotation, coordinates @ rotation, noise)
+    return Workspace(mean, q @ rotation, coordinates @ rotation)
 
 
-def _sketch(reader: Reader, probes: Array, block: int) -> tuple[Array, Array] | None:
-    """Mean column and (X - mean) Omega; None if an entry is missing."""
+def _sketch(reader: Reader, probes: Array, block: int) -> tuple[Array, Array]:
+    """Mean column and (X - mean) Omega."""
     n_rows, n_columns = reader.source.shape
     total = np.zeros(n_rows)
     sketch = np.zeros((n_rows, probes.shape[1]), dtype=reader.dtype)
     for columns in blocks_of(np.arange(n_columns), block):
         data = reader.block(columns)
         if data.weights.min() < 1:
-            return None
+            raise InputError(
+                "matrix: expected complete columns, received some with missing entries; fill "
+                "them with `complete` first"
+            )
         report("principal components", int(columns[0]), n_columns)
         total += data.values.sum(axis=1, dtype=np.float64)
         sketch += data.values @ probes[columns].astype(reader.dtype)
@@ -87,19 +88,3 @@ def _power_step(reader: Reader, mean: Array, q: Array, block: int) -> tuple[Arra
         coordinates[columns] = centred.T @ q
         sketch += centred @ coordinates[columns]
     return sketch, coordinates
-
-
-def completed_workspace(reader: Reader, rank: int, block: int, seed: int) -> Workspace:
-    """Centred completion of the matrix, its coefficients centred again."""
-    rng = np.random.default_rng(seed)
-    rank = min(rank, *reader.source.shape)
-    model = fit_map(reader, rank, COMPLETION_PASSES, block, True, rng).model
-    coordinates = map_coefficients(reader, model, block)[0]
-    centre = coordinates.mean(axis=0)
-    mean = model.offset + model.basis @ centre
-    return Workspace(
-        mean.astype(reader.dtype),
-        model.basis,
-        (coordinates - centre).astype(reader.dtype),
-        model.noise,
-    )

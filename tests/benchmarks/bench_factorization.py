@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from benchmarks.measuring import Results
-from factorization.problems import hemisphere, problem, unobserved_error
+from factorization.problems import hemisphere, problem, reconstructed, unobserved_error
 from sklearn.decomposition import IncrementalPCA
 from sklearn.utils.extmath import randomized_svd
 
@@ -144,7 +144,7 @@ def completion(pattern, sizes, limits):
         ("Brand, block 64, 4 passes", brand(4), 4),
     ]:
         fit, seconds, megabytes = measured(call)
-        errors[label] = unobserved_error(fit.reconstruct(), data, DETERMINED)
+        errors[label] = unobserved_error(reconstructed(fit), data, DETERMINED)
         nanoseconds = seconds / passes / data.truth.size * 1e9
         row(
             label, errors[label], seconds, megabytes, f"{nanoseconds:.0f} ns per entry and pass"
@@ -256,12 +256,13 @@ def local(n_columns, n_side, aligned):
     errors = {}
     for label, options in [
         ("local PCA 16 x 10", LocalPCA(16, 10)),
-        (f"PCA {n_pca}", LocalPCA(1, n_pca, method="pca")),
-        (f"VQ {n_vq}", LocalPCA(n_vq, 0, method="vq", iterations=15)),
+        (f"PCA {n_pca}", LocalPCA(1, n_pca)),
+        (f"VQ {n_vq}", LocalPCA(n_vq, 0, iterations=15)),
     ]:
         fit, seconds, megabytes = measured(lambda o=options: o.fit(columns))
-        errors[label[:3]] = fit.relative_error
-        row(label, fit.relative_error, seconds, megabytes, f"{len(fit.history)} iterations")
+        error = fit.residual / np.sqrt(np.mean(columns**2, dtype=np.float64))
+        errors[label[:3]] = error
+        row(label, error, seconds, megabytes, f"{len(fit.history)} iterations")
         if label.startswith("local"):
             labels = fit.labels
     space = pca_workspace(reader_of(as_source(columns), 1, 256), 96, 256, 0)

@@ -80,3 +80,12 @@ def clustered_subspaces(
         columns[:, members] = centres[cluster][:, None] + basis @ spread
     columns += noise * rng.standard_normal(columns.shape)
     return columns.astype(np.float32), labels
+
+
+def reconstructed(fit, columns=slice(None)):
+    """Columns (n_rows, k) of a `Completion` or a `ClusteredBasis`; all by default."""
+    coefficients = np.atleast_2d(fit.coefficients[columns])
+    if not hasattr(fit, "labels"):
+        return fit.mean[:, None] + fit.basis @ coefficients.T
+    labels = np.atleast_1d(fit.labels[columns])
+    return fit.means[labels].T + np.einsum("krc,kc->rk", fit.bases[labels], coefficients)
