@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.encoding import SRGB, Encoding, decode_srgb
 from reflfield.errors import InputError
@@ -24,6 +24,8 @@ REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 ADOBE_GAMMA = 563 / 256
+# Relative luminance of linear Rec.709, the primaries that all radiance is stored in.
+LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 # Differences of chromaticities, and of what profiles say, that are rounding.
 SAME_CHROMATICITY = 2e-3
 SAME_MATRIX = 5e-3
@@ -35,6 +37,26 @@ _BRADFORD = np.array(
 )
 LARGEST_PROFILE = 1 << 24
 MOST_ICC_TAGS = 100
+
+
+def luminance(radiance: ArrayLike) -> Float64:
+    """Relative luminance of linear Rec.709 colours.
+
+    Parameters
+    ----------
+    radiance : (..., 3) array_like
+        Linear radiance.
+
+    Returns
+    -------
+    (...) float64
+
+    Examples
+    --------
+    >>> float(luminance([1.0, 0.0, 0.0]))
+    0.2126
+    """
+    return np.asarray(radiance, dtype=np.float64) @ np.array(LUMINANCE_WEIGHTS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from reflfield.capture.capture import PLANE, Capture
 from reflfield.errors import CaptureError
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.metrics.image_metrics import COVERAGE_OF_OBJECT
+from reflfield.render.exposure import COVERAGE_OF_OBJECT
 from reflfield.util.files import load_arrays
 
 Float32 = NDArray[np.float32]

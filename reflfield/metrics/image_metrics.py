@@ -1,13 +1,7 @@
 """How close relit pictures are to photographs, in the units of the literature.
 
-All measures are taken over *object pixels*: pixels whose silhouette coverage is
-at least one half, eroded by two pixels, so that neither the backdrop nor the
-anti-aliased rim counts. One exposure serves all frames of a comparison,
-
-    e = 1 / (99.5th percentile of the photographs' luminance over the object
-             pixels of all frames),
-
-and nothing is rescaled per picture or per channel: the lights are known.
+All measures are taken over the *object pixels* of `reflfield.render.exposure`, at the common
+exposure of the photographs; nothing is rescaled per image or per channel.
 """
 
 from __future__ import annotations
@@ -20,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_erosion
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.metrics.image_errors import (
@@ -31,13 +24,14 @@ from reflfield.metrics.image_errors import (
     ssim_map,
     strips,
 )
-from reflfield.metrics.tonemapping import ThinnedValues, display, luminance
+from reflfield.render.exposure import (
+    COVERAGE_OF_OBJECT,
+    ExposureMeter,
+    display,
+    object_pixels,
+)
 
 Image = NDArray[np.float64]
-
-COVERAGE_OF_OBJECT = 0.5
-EROSION_PX = 2
-EXPOSURE_PERCENTILE = 99.5
 
 # What is said of a frame, in the order of ``metrics.json``.
 FRAME_KEYS = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels", "n_excluded",
@@ -218,32 +212,6 @@ def metrics_text(compared: Mapping[str, Any] | None, **more: Any) -> str:
     return json.dumps({**kept, **more}, indent=2, allow_nan=False) + "\n"
 
 
-def object_pixels(silhouette: ArrayLike) -> NDArray[np.bool_]:
-    """Pixels that count: coverage >= 0.5, eroded by a disk of radius 2 pixels.
-
-    Beyond the border of the picture nothing is known to be object, so the two
-    outermost pixels never count.
-
-    Parameters
-    ----------
-    silhouette : (h, w) array_like
-        Coverage, 0 to 1.
-
-    Returns
-    -------
-    (h, w) bool
-        True where the pixel counts.
-
-    Examples
-    --------
-    >>> object_pixels(np.ones((7, 6))).sum(axis=1).tolist()
-    [0, 0, 2, 2, 2, 0, 0]
-    """
-    covered = np.asarray(silhouette) >= COVERAGE_OF_OBJECT
-    # Two rounds of the 4-neighbour cross remove exactly the disk of radius 2.
-    return binary_erosion(covered, iterations=EROSION_PX)
-
-
 def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     """Exposure e of a whole comparison; one pass over the photographs.
 
@@ -264,33 +232,22 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     InputError
         If no frame has an object pixel.
 
-    Notes
-    -----
-    Exact up to `ThinnedValues.most` object pixels, of an even part of them beyond.
-
     Examples
     --------
     >>> grey = np.full((9, 9, 3), 0.25)
     >>> round(common_exposure([(grey, np.ones((9, 9)))]), 6)
     4.0
     """
-    kept, n_frames = ThinnedValues(), 0
+    meter, n_frames = ExposureMeter(), 0
     for photograph, silhouette in pictures:
         n_frames += 1
-        kept.add(luminance(np.asarray(photograph)[_counted(silhouette)]))
-    values = kept.values
-    if values.size == 0:
+        meter.add(photograph, silhouette)
+    if meter.is_empty:
         raise NothingToMeasure(
             "frames: expected at least one object pixel to set the exposure from, received "
             f"none in {n_frames} frames; check the silhouettes"
         )
-    white = float(np.percentile(values, EXPOSURE_PERCENTILE))
-    return 1.0 / white if white > 0.0 else math.nan
-
-
-def _counted(silhouette: ArrayLike) -> NDArray[np.bool_]:
-    pixels: NDArray[Any] = np.asarray(silhouette)
-    return pixels if pixels.dtype == np.bool_ else object_pixels(pixels)
+    return meter.exposure
 
 
 def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -> Comparison:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.color_spaces import LUMINANCE_WEIGHTS
 from reflfield.observations.frame_resampling import Nodes, ResamplingOptions, resample, side_for
 from reflfield.observations.image_projection import directions_of, facing_irradiance
 from reflfield.observations.store import Bools, ObservationStore, Observed
@@ -26,7 +27,7 @@ Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 # Rec.709 luminance: what alignment correlates.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+LUMINANCE = np.array(LUMINANCE_WEIGHTS, np.float32)
 
 
 def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reflfield.capture.color_spaces import luminance
 from reflfield.capture.image_files import image_size, read_image
 from reflfield.capture.lights import CONVENTIONS, Light
 from reflfield.errors import InputError
 from reflfield.render.distant_lights import DistantLights, merged_lights
-from reflfield.render.exposure import luminance
 from reflfield.render.map_directions import direction_from_uv, world_from_map
 from reflfield.util.validation import check_shape, not_a_rotation_because
 

@@ -13,7 +13,7 @@ from reflfield.capture.image_files import read_image
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
-from reflfield.render.exposure import common_exposure, covered_luminances, encoded_picture
+from reflfield.render.exposure import ExposureMeter, encoded_picture
 from reflfield.render.renderer import Renderer, Rendering, RenderOptions
 from reflfield.util.progress import track
 
@@ -80,7 +80,7 @@ def relight_frames(
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     renderer = Renderer(field, options)
-    relit, luminances = [], []
+    relit, meter = [], ExposureMeter()
     total = len(frames.photographs)
     for photograph in track(frames.photographs, total, "relighting"):
         camera, light = frames.cameras[photograph.camera], frames.lights[photograph.light]
@@ -92,10 +92,10 @@ def relight_frames(
             folder / f"{photograph.name}.png",
         )
         write_exr(frame.exr, _with_coverage(rendering), names=["R", "G", "B", "A"])
-        luminances.append(covered_luminances(rendering.image, rendering.coverage))
+        meter.add(rendering.image, rendering.coverage)
         relit.append((frame.exr, frame.png))
         yield frame
-    factor = common_exposure(luminances) if exposure is None else exposure
+    factor = meter.exposure_or_one if exposure is None else exposure
     for exr, png in relit:
         write_png(png, encoded_picture(read_image(exr), factor))
 

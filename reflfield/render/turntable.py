@@ -15,7 +15,7 @@ from reflfield.capture.cameras import OPENCV, Camera, looking_at
 from reflfield.capture.image_writing import write_png
 from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
-from reflfield.render.exposure import common_exposure, covered_luminances, encoded_picture
+from reflfield.render.exposure import ExposureMeter, encoded_picture
 from reflfield.render.renderer import Lighting, Renderer, RenderOptions
 from reflfield.util.files import replacing
 from reflfield.util.progress import track
@@ -54,7 +54,7 @@ class OrbitOptions:
     frames_per_second : float
         Speed of the animation, 0.1 to 1000.
     exposure : float, optional
-        Factor before the sRGB encoding; by default that of `common_exposure`.
+        Factor before the sRGB encoding; by default that of an `ExposureMeter`.
 
     Raises
     ------
@@ -183,14 +183,14 @@ def render_orbit(
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     renderer = Renderer(field, options)
-    images, luminances = [], []
+    images, meter = [], ExposureMeter()
     cameras = orbit_cameras(field.positions, orbit)
     for camera in track(cameras, len(cameras), "turntable"):
         rendering = renderer.render(camera, lights)
-        luminances.append(covered_luminances(rendering.image, rendering.coverage))
+        meter.add(rendering.image, rendering.coverage)
         # Half floats: a turntable of 100 frames of 400 pixels stays under 100 MB.
         images.append(np.minimum(rendering.image, 65504.0).astype(np.float16))
-    exposure = common_exposure(luminances) if orbit.exposure is None else orbit.exposure
+    exposure = meter.exposure_or_one if orbit.exposure is None else orbit.exposure
     pictures = [encoded_picture(image, exposure) for image in images]
     frames = [folder / f"orbit_{i:03d}.png" for i in range(len(pictures))]
     for path, picture in zip(frames, pictures, strict=True):

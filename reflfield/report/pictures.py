@@ -1,4 +1,4 @@
-"""Arrays to pictures: false colour, normals, overlays, rows, contact sheets.
+"""Arrays to pictures: false colour, normals, overlays, textures.
 
 Everything here is an (h, w, 3) uint8 array, sRGB encoded, ready to be stored.
 """
@@ -6,7 +6,6 @@ Everything here is an (h, w, 3) uint8 array, sRGB encoded, ready to be stored.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -16,75 +15,18 @@ from PIL import Image as PillowImage
 from scipy.ndimage import binary_dilation
 
 from reflfield.errors import InputError
-from reflfield.metrics.tonemapping import display
+from reflfield.render.exposure import UNKNOWN_CODE
 from reflfield.util.validation import check_shape
 
 Encoded = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-# Rows of a photograph that are shown in colour together.
-ROWS_AT_ONCE = 64
 # Neutral grey: neither the dark nor the light end of any colour map used here.
-NOTHING: Colour = (128, 128, 128)
+NOTHING: Colour = (UNKNOWN_CODE, UNKNOWN_CODE, UNKNOWN_CODE)
 SILHOUETTE_COLOUR: Colour = (0, 200, 255)
 HULL_COLOUR: Colour = (255, 120, 0)
 MISSING_COLOUR: Colour = (230, 40, 90)
 EXCESS_COLOUR: Colour = (250, 200, 30)
-
-
-def tonemapped(image: ArrayLike, exposure: float) -> Encoded:
-    """Linear radiance as 8-bit sRGB at a given exposure.
-
-    Parameters
-    ----------
-    image : (h, w, 3) array_like
-        Linear radiance; values that are not finite become grey.
-    exposure : float
-        The factor common to all pictures shown side by side.
-
-    Returns
-    -------
-    (h, w, 3) uint8
-
-    Examples
-    --------
-    >>> tonemapped(np.full((1, 1, 3), 0.108), exposure=2.0)[0, 0].tolist()
-    [128, 128, 128]
-    """
-    linear = np.asarray(image)
-    picture = np.full(linear.shape, NOTHING, np.uint8)
-    # Some rows at a time: double precision of a photograph takes ten times its memory.
-    for first in range(0, len(linear), ROWS_AT_ONCE):
-        rows = np.asarray(linear[first : first + ROWS_AT_ONCE], np.float64)
-        finite = np.isfinite(rows).all(axis=-1, keepdims=True)
-        shown = _eight_bit(display(np.where(finite, rows, 0.0), exposure))
-        np.copyto(picture[first : first + ROWS_AT_ONCE], shown, where=finite)
-    return picture
-
-
-def exposure_for(image: ArrayLike, shown: ArrayLike, percentile: float = 99.5) -> float:
-    """Exposure that brings a percentile of the brightest channel to white.
-
-    For pictures without a photograph to agree with, such as a mean texture.
-
-    Parameters
-    ----------
-    image : (..., 3) array_like
-        Linear radiance.
-    shown : (...) array_like of bool
-        True where the picture has content.
-    percentile : float
-        0 to 100.
-
-    Returns
-    -------
-    float
-        1 if nothing is brighter than black.
-    """
-    values = np.asarray(image, dtype=np.float64)[np.asarray(shown, dtype=bool)].max(axis=-1)
-    values = values[np.isfinite(values)]
-    white = float(np.percentile(values, percentile)) if values.size else 0.0
-    return 1.0 / white if white > 0.0 else 1.0
 
 
 def false_colour(
@@ -379,54 +321,6 @@ def enlarged(picture: NDArray[Any], factor: int) -> NDArray[Any]:
     [[1, 1, 2, 2], [1, 1, 2, 2]]
     """
     return np.repeat(np.repeat(picture, factor, axis=0), factor, axis=1)
-
-
-def contact_sheet(
-    pictures: Sequence[Encoded],
-    n_columns: int | None = None,
-    gap: int = 4,
-    colour: Colour = NOTHING,
-) -> Encoded:
-    """Pictures in a grid, row by row.
-
-    Parameters
-    ----------
-    pictures : sequence of (h, w, 3) uint8
-        At least one; sizes may differ.
-    n_columns : int, optional
-        Default: about as many columns as rows.
-    gap : int
-        Pixels between neighbours.
-    colour : tuple of three int
-        Of gaps and empty cells.
-
-    Returns
-    -------
-    (h, w, 3) uint8
-
-    Raises
-    ------
-    InputError
-        If there is no picture.
-
-    Examples
-    --------
-    >>> contact_sheet([np.zeros((2, 3, 3), np.uint8)] * 5, n_columns=3, gap=1).shape
-    (5, 11, 3)
-    """
-    if not pictures:
-        raise InputError("contact_sheet: expected at least one picture, received none")
-    columns = n_columns or math.ceil(math.sqrt(len(pictures)))
-    rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
-    heights = [max(p.shape[0] for p in row) for row in rows]
-    widths = [max(p.shape[1] for p in pictures[c::columns]) for c in range(len(rows[0]))]
-    tops = np.concatenate([[0], np.cumsum(np.array(heights) + gap)])
-    lefts = np.concatenate([[0], np.cumsum(np.array(widths) + gap)])
-    sheet = np.full((tops[-1] - gap, lefts[-1] - gap, 3), colour, dtype=np.uint8)
-    for i, picture in enumerate(pictures):
-        top, left = tops[i // columns], lefts[i % columns]
-        sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-    return sheet
 
 
 def _eight_bit(values: ArrayLike) -> Encoded:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 from skimage.metrics import structural_similarity
 
+from reflfield.capture.color_spaces import luminance
 from reflfield.errors import InputError, ShapeError
 from reflfield.metrics.image_errors import PIXELS_PER_DEGREE, PSNR_CAP_DB
 from reflfield.metrics.image_metrics import (
@@ -23,9 +24,8 @@ from reflfield.metrics.image_metrics import (
     common_exposure,
     compare_frames,
     flip_errors,
-    object_pixels,
 )
-from reflfield.metrics.tonemapping import ThinnedValues, display, luminance
+from reflfield.render.exposure import ThinnedValues, display, object_pixels
 
 
 def disk(size, radius):

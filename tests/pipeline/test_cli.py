@@ -18,7 +18,7 @@ import reflfield.cli as cli
 from reflfield.capture.image_files import read_coverage
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.errors import InputError
-from reflfield.metrics.image_metrics import object_pixels
+from reflfield.render.exposure import object_pixels
 from reflfield.util import terminal
 from reflfield.util.progress import ProgressLines, listening, report
 

@@ -13,9 +13,9 @@ from reflfield.capture.readers import open_capture
 from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.metrics.comparison_silhouettes import projected_coverage, write_frame_silhouettes
-from reflfield.metrics.image_metrics import object_pixels
 from reflfield.options import HoldOut
 from reflfield.pipeline.hold_out import split_of
+from reflfield.render.exposure import object_pixels
 
 BARE = (
     "--set", "comparison.without_alignment=false",

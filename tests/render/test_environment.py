@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from reflfield.capture.color_spaces import luminance
 from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
@@ -20,7 +21,6 @@ from reflfield.field.synthetic import (
 )
 from reflfield.geometry.mesh import read_ply
 from reflfield.render.environment_map import EnvironmentMap, direction_from_uv
-from reflfield.render.exposure import luminance
 from reflfield.render.renderer import Renderer, RenderOptions, render
 from reflfield.render.turntable import OrbitOptions, orbit_cameras
 from reflfield.sphere.rotations import frames_from_normals

@@ -11,7 +11,7 @@ from reflfield.capture.image_files import read_coverage, read_image
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.field.synthetic import baked_field, lambert, sphere_surface
-from reflfield.render.exposure import common_exposure, covered_luminances
+from reflfield.render.exposure import ExposureMeter
 from reflfield.render.relit_photographs import relight_frames
 from reflfield.render.renderer import RenderOptions, render
 from reflfield.render.turntable import OrbitOptions, orbit_cameras, render_orbit
@@ -54,8 +54,10 @@ def test_each_frame_has_its_own_camera_and_light(field, tmp_path):
 
 def test_pictures_share_one_exposure(field, tmp_path):
     relit = list(relight_frames(field, frames_of(field), tmp_path, FAST))
-    pooled = [covered_luminances(r.rendering.image, r.rendering.coverage) for r in relit]
-    exposure = common_exposure(pooled)
+    meter = ExposureMeter()
+    for frame in relit:
+        meter.add(frame.rendering.image, frame.rendering.coverage)
+    exposure = meter.exposure
     for frame in relit:
         decoded = read_image(frame.png)
         wanted = np.clip(frame.rendering.image * exposure, 0, 1)
@@ -136,5 +138,7 @@ def test_bad_turntables_are_refused(change, text):
 
 
 def test_exposure_of_nothing_is_one():
-    assert common_exposure([]) == 1.0
-    assert common_exposure([np.zeros(5)]) == 1.0
+    meter = ExposureMeter()
+    assert meter.exposure_or_one == 1.0
+    meter.add(np.zeros((9, 9, 3)), np.ones((9, 9)))
+    assert meter.exposure_or_one == 1.0

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError, ShapeError
+from reflfield.render.exposure import ExposureMeter, encoded_picture
 from reflfield.report import pictures
 
 
@@ -17,7 +18,7 @@ def test_normals_can_be_read_back(rng):
 
 def test_tonemapping_is_exact_at_the_ends_and_grey_where_unknown():
     image = np.array([[[0, 0, 0], [0.5, 0.5, 0.5], [9, 9, 9], [np.nan, 0, 0]]])
-    shown = pictures.tonemapped(image, exposure=2.0)[0]
+    shown = encoded_picture(image, exposure=2.0)[0]
     assert shown.tolist() == [[0] * 3, [255] * 3, [255] * 3, [128] * 3]
 
 
@@ -26,10 +27,10 @@ def test_exposure_ignores_what_is_not_shown():
     image[0] = 100
     shown = np.ones((4, 4), bool)
     shown[0] = False
-    assert pictures.exposure_for(image, shown) == 1
-    assert pictures.exposure_for(4 * image, shown) == 0.25
-    assert pictures.exposure_for(0 * image, shown) == 1
-    assert pictures.exposure_for(image, np.zeros((4, 4), bool)) == 1
+    for brightness, expected in ((1, 1), (4, 0.25), (0, 1)):
+        meter = ExposureMeter()
+        meter.add(brightness * image, shown)
+        assert meter.exposure_or_one == pytest.approx(expected, rel=1e-12)
 
 
 def test_false_colour_is_monotone_and_clips():
@@ -71,18 +72,6 @@ def test_texture_places_each_texel(rng):
     with pytest.raises(InputError, match="texel_of_pixel"):
         pictures.texture(values[:5], layout)
     assert np.isnan(pictures.texture(np.zeros((0, 3)), [[-1]])).all()
-
-
-def test_contact_sheet_keeps_every_pixel(rng):
-    tiles = [rng.integers(1, 255, (3 + i, 5 - i, 3), dtype=np.uint8) for i in range(3)]
-    sheet = pictures.contact_sheet(tiles, n_columns=2, gap=2, colour=(0, 0, 0))
-    assert sheet.shape == (4 + 2 + 5, 5 + 2 + 4, 3)
-    assert np.array_equal(sheet[:3, :5], tiles[0])
-    assert np.array_equal(sheet[:4, 7:11], tiles[1])
-    assert np.array_equal(sheet[6:11, :3], tiles[2])
-    assert sheet.sum(dtype=int) == sum(tile.sum(dtype=int) for tile in tiles)
-    with pytest.raises(InputError, match="at least one"):
-        pictures.contact_sheet([])
 
 
 def test_shrinking_keeps_the_mean(rng):

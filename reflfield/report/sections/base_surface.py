@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.metrics.image_metrics import (
-    COVERAGE_OF_OBJECT,
-)
+from reflfield.render.exposure import COVERAGE_OF_OBJECT, ExposureMeter, encoded_picture
 from reflfield.report import pictures, plots
 from reflfield.report.page import (
     Cell,
@@ -124,16 +122,23 @@ def _covered(silhouette: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(silhouette >= COVERAGE_OF_OBJECT)
 
 
+def _exposure_of(image: NDArray[Any], shown: NDArray[np.bool_]) -> float:
+    """Exposure of an image that is not compared with another."""
+    meter = ExposureMeter()
+    meter.add(image, shown)
+    return meter.exposure_or_one
+
+
 def _overlay(view: SilhouetteView) -> Picture:
     covered = _covered(view.silhouette)
     hull = _covered(view.hull_silhouette)
     box = pictures.bounding_box(covered | hull, margin=8)
     photograph, seen = np.asarray(view.photograph)[box], covered[box]
-    exposure = pictures.exposure_for(photograph, seen)
+    exposure = _exposure_of(photograph, seen)
     # Outlines are one pixel wide; on small photographs that would hide the gaps.
     factor = max(1, SHEET_PX // max(seen.shape))
     painted = pictures.silhouettes_overlay(
-        pictures.enlarged(pictures.tonemapped(photograph, exposure), factor),
+        pictures.enlarged(encoded_picture(photograph, exposure), factor),
         pictures.enlarged(np.asarray(view.silhouette)[box], factor),
         pictures.enlarged(np.asarray(view.hull_silhouette)[box], factor),
     )
@@ -165,13 +170,13 @@ def atlas_section(
     """
     colours = np.asarray(mean_sample, dtype=np.float64)
     seen = np.isfinite(colours).all(axis=-1)
-    exposure = pictures.exposure_for(colours, seen)
+    exposure = _exposure_of(colours, np.asarray(seen))
     layout = pictures.texture(np.asarray(charts), texel_of_pixel, nothing=-1)
     figure = Figure(
         (
             _atlas_panel(pictures.labels_coloured(layout), texel_of_pixel, "charts"),
             _atlas_panel(
-                pictures.tonemapped(pictures.texture(colours, texel_of_pixel), exposure),
+                encoded_picture(pictures.texture(colours, texel_of_pixel), exposure),
                 texel_of_pixel,
                 "mean over all views and lights",
             ),

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from reflfield.errors import InputError
 from reflfield.metrics.image_errors import PSNR_CAP_DB
 from reflfield.metrics.image_metrics import (
-    COVERAGE_OF_OBJECT,
     Comparison,
     FrameMetrics,
     FramePair,
     flip_errors,
     worst_to_best,
 )
+from reflfield.render.exposure import COVERAGE_OF_OBJECT, encoded_picture
 from reflfield.report import pictures, plots
 from reflfield.report.page import (
     ColourBar,
@@ -105,7 +105,7 @@ def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> Com
         )
     box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
     photograph, relit = (
-        encode_picture(pictures.fitted(pictures.tonemapped(image[box], exposure), ROW_PX))
+        encode_picture(pictures.fitted(encoded_picture(image[box], exposure), ROW_PX))
         for image in (np.asarray(pair.photograph), np.asarray(pair.relit))
     )
     errors = np.where(pair.counted, flip_errors(pair, exposure), np.float32(np.nan))[box]
