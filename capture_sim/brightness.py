@@ -16,13 +16,14 @@ from capture_sim.effects.registry import decided
 from capture_sim.effects.sensor import dark_noise
 from capture_sim.model import Brightness, Scene, Table
 from capture_sim.rays import RayTracer
-from capture_sim.render import sample_view, shade
+from capture_sim.render import shade
+from capture_sim.view_samples import sample_view
 
 # Enough to meet near and far sides of the object, few enough to take no time.
-TRIAL_VIEWS = 8
-TRIAL_LIGHTS = 8
+SAMPLE_VIEWS = 8
+SAMPLE_LIGHTS = 8
 # Pixels along the larger side of the images that are tried.
-TRIAL_SIDE = 96
+SAMPLE_SIDE = 96
 # Photographs that were not tried may be brighter, darker or more glaring by this factor.
 SAFETY = 4.0
 
@@ -102,9 +103,9 @@ def _brightness(scene: Scene, tracer: RayTracer) -> Brightness:
     basic = {near_lights.NAME, antialiasing.NAME}
     basic |= set() if scene.mesh.convex else {shadows.NAME}
     plain = replace(scene, effects=replace(scene.effects, active=frozenset(basic)))
-    lights = tuple(scene.lights[i] for i in spread(len(scene.lights), TRIAL_LIGHTS))
+    lights = tuple(scene.lights[i] for i in spread(len(scene.lights), SAMPLE_LIGHTS))
     scales, peaks = [], []
-    for index in spread(len(scene.cameras), TRIAL_VIEWS):
+    for index in spread(len(scene.cameras), SAMPLE_VIEWS):
         view = sample_view(plain, tracer, coarser(scene.cameras[index]))
         for image in shade(plain, tracer, view, lights):
             scales.append(frame_scale(image))
@@ -112,7 +113,7 @@ def _brightness(scene: Scene, tracer: RayTracer) -> Brightness:
     return _summary(np.array(scales), np.array(peaks), dark_noise(scene))
 
 
-def coarser(camera: Table, side: int = TRIAL_SIDE) -> Table:
+def coarser(camera: Table, side: int = SAMPLE_SIDE) -> Table:
     """The same camera with larger pixels, if it has more than so many along its larger side.
 
     Parameters

@@ -23,8 +23,9 @@ from capture_sim.effects import (
 from capture_sim.errors import scene_error
 from capture_sim.inputs import megabytes
 from capture_sim.model import Blocks, Scene
-from capture_sim.render import BYTES_PER_VALUE, lookup_nodes, rays_per_side
+from capture_sim.render import BYTES_PER_VALUE, lookup_nodes
 from capture_sim.shading import BYTES_PER_PAIR
+from capture_sim.view_samples import rays_per_side
 from capture_sim.visibility import pixels_across
 
 # Compiling what has not been compiled before, libraries' buffers, memory that is freed but

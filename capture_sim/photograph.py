@@ -27,7 +27,8 @@ from capture_sim.effects.rig import real_rig
 from capture_sim.model import Scene, Table
 from capture_sim.placement import check_outside
 from capture_sim.rays import RayTracer
-from capture_sim.render import ViewSamples, render_view, sample_view
+from capture_sim.render import render_view
+from capture_sim.view_samples import ViewSamples, sample_view
 from capture_sim.visibility import TracedLights
 
 Float32 = NDArray[np.float32]

@@ -23,14 +23,15 @@ from capture_sim.memory import fitted
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer
 from capture_sim.record import bound_text
-from capture_sim.render import ViewSamples, arriving_light, sample_view, shade
+from capture_sim.render import arriving_light, shade
 from capture_sim.truth import write_view_truth
+from capture_sim.view_samples import ViewSamples, sample_view
 
 # Timed in earnest: enough to average over the sides of the object.
-TRIAL_VIEWS = 3
-TRIAL_LIGHTS = 6
+SAMPLE_VIEWS = 3
+SAMPLE_LIGHTS = 6
 # Pixels along the larger side of the images that are tried; counts grow with the pixels.
-TRIAL_SIDE = 512
+SAMPLE_SIDE = 512
 
 Table = Mapping[str, Any]
 Result = TypeVar("Result")
@@ -144,15 +145,15 @@ def plan(scene: Scene, *, max_memory: int | None = None) -> Plan:
     scene = measured(scene, tracer)
     if max_memory is not None:
         scene = fitted(scene, 1, max_memory)
-    trial = _run_trial(scene, tracer)
+    sample_run = _run_sample(scene, tracer)
     n_views, n_lights = len(scene.cameras), len(scene.lights)
-    points = trial.points_per_view * n_views
+    points = sample_run.points_per_view * n_views
     work = Workload(
         n_views=n_views,
         n_lights=n_lights,
         n_pixels=sum(int(camera["w"]) * int(camera["h"]) for camera in scene.cameras),
         n_points=int(points),
-        n_lit=int(points * n_lights * trial.lit_fraction),
+        n_lit=int(points * n_lights * sample_run.lit_fraction),
     )
     frames = work.n_photographs + scene.heldout_frames
     fixed_bytes = 4 * scene.truth.points * work.n_photographs  # samples, deflated to a third
@@ -161,9 +162,10 @@ def plan(scene: Scene, *, max_memory: int | None = None) -> Plan:
         scene=scene.name,
         work=work,
         effects=tuple(_planned(effect, scene, work) for effect in EFFECTS),
-        seconds=n_views * trial.view_seconds + frames * trial.photograph_seconds,
+        seconds=n_views * sample_run.view_seconds + frames * sample_run.photograph_seconds,
         repairs=scene.mesh.notes,
-        bytes=int(n_views * trial.view_bytes + frames * trial.photograph_bytes) + fixed_bytes,
+        bytes=int(n_views * sample_run.view_bytes + frames * sample_run.photograph_bytes)
+        + fixed_bytes,
     )
 
 
@@ -175,7 +177,7 @@ def _planned(effect: Effect, scene: Scene, work: Workload) -> PlannedEffect:
 
 
 @dataclass(frozen=True)
-class _Trial:
+class _SampleRun:
     """Means over a few views and lights."""
 
     points_per_view: float
@@ -186,11 +188,11 @@ class _Trial:
     photograph_bytes: float
 
 
-def _run_trial(scene: Scene, tracer: RayTracer) -> _Trial:
-    cameras = spread(len(scene.cameras), TRIAL_VIEWS)
-    lights = tuple(scene.lights[i] for i in spread(len(scene.lights), TRIAL_LIGHTS))
+def _run_sample(scene: Scene, tracer: RayTracer) -> _SampleRun:
+    cameras = spread(len(scene.cameras), SAMPLE_VIEWS)
+    lights = tuple(scene.lights[i] for i in spread(len(scene.lights), SAMPLE_LIGHTS))
     columns = [_one_view(scene, tracer, camera, lights) for camera in cameras]
-    return _Trial(*(float(column) for column in np.mean(columns, axis=0)))
+    return _SampleRun(*(float(column) for column in np.mean(columns, axis=0)))
 
 
 def _one_view(
@@ -198,7 +200,7 @@ def _one_view(
 ) -> tuple[float, ...]:
     """Points, lit part, seconds and bytes of a view, and of a photograph."""
     whole = scene.cameras[camera]
-    identity = coarser(whole, TRIAL_SIDE)
+    identity = coarser(whole, SAMPLE_SIDE)
     more = whole["w"] * whole["h"] / (identity["w"] * identity["h"])
     view, view_seconds = _timed(lambda: sample_view(scene, tracer, identity))
     images, shade_seconds = _timed(lambda: shade(scene, tracer, view, lights))

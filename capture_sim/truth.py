@@ -33,15 +33,10 @@ from capture_sim.files import (
 from capture_sim.heldout import heldout_pairs, transforms_frame
 from capture_sim.model import Scene
 from capture_sim.rays import Hits, RayTracer, camera_rays, towards_camera, world_from_camera
-from capture_sim.render import (
-    arriving_light,
-    lit_pairs,
-    reflectance_of_pairs,
-    sample_view,
-    shade,
-)
+from capture_sim.render import arriving_light, lit_pairs, reflectance_of_pairs, shade
 from capture_sim.shading import BYTES_PER_PAIR
 from capture_sim.surface import SurfacePoints, spread_points, surface_points
+from capture_sim.view_samples import sample_view
 
 Table = Mapping[str, Any]
 Arrays = dict[str, NDArray[Any]]

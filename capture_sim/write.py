@@ -40,9 +40,10 @@ from capture_sim.model import Scene
 from capture_sim.photograph import Setup, photographs, set_up
 from capture_sim.rays import RayTracer
 from capture_sim.record import write_record
-from capture_sim.render import sample_view, traced_lights
+from capture_sim.render import traced_lights
 from capture_sim.stopwatch import Stopwatch
 from capture_sim.truth import write_truth, write_view_truth
+from capture_sim.view_samples import sample_view
 from capture_sim.visibility import TracedLights
 
 Table = Mapping[str, Any]

@@ -10,16 +10,11 @@ i, one path adds to light k
           L_k(x_i \to x_{i-1}).
 
 The estimate has no bias but that of `Options.bounces`; its variance is estimated from the
-scatter of a point's paths. The numbers are hashes of the point: the same whatever the
-order of work.
+scatter of a point's paths. How directions are drawn is in `capture_sim.effects.directions`.
 
 References
 ----------
 J. T. Kajiya, "The rendering equation", SIGGRAPH 1986.
-E. Veach and L. J. Guibas, "Optimally combining sampling techniques for Monte Carlo
-rendering", SIGGRAPH 1995 (the mixture of two densities).
-M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018 (the stratified
-first directions).
 """
 
 from __future__ import annotations
@@ -35,9 +30,8 @@ from numpy.typing import NDArray
 from capture_sim.arrival import LightArrays
 from capture_sim.effects import Cost, Decision, Stage, Workload
 from capture_sim.effects.bounds import steepness
+from capture_sim.effects.directions import cosine_directions, draw_directions, fill_numbers
 from capture_sim.materials import Lambert, Material
-from capture_sim.materials.analytic import ggx_density
-from capture_sim.materials.base import SMALLEST_DENOMINATOR, half_vectors
 from capture_sim.materials.textures import Constant
 from capture_sim.model import Scene
 from capture_sim.objects import SurfaceMesh
@@ -57,10 +51,10 @@ Float32 = NDArray[np.float32]
 BYTES_PER_PATH = 1200
 BYTES_BROUGHT = 200
 # Points and directions that form factors and albedos are measured with.
-TRIAL_POINTS, TRIAL_DIRECTIONS = 1024, 256
+SAMPLE_POINTS, SAMPLE_DIRECTIONS = 1024, 256
 # Highlights steeper than this, 1/rad, are too narrow for these directions.
 STEEPEST = 30.0
-# Points and lights of the trial that the standard error is stated from.
+# Points and lights that the standard error is estimated from.
 ERROR_POINTS, ERROR_LIGHTS = 128, 8
 # Paths whose throughput has fallen below 1 go on with that probability from here.
 ROULETTE_FROM = 2
@@ -152,8 +146,8 @@ def apply(
     """
     radiance = np.zeros((len(points), 3, len(lights)), dtype=np.float32)
     for block in _blocks(scene, points, lights):
-        found = _traced_paths(scene, tracer, points[block], views[block], lights, traced)
-        radiance[block] = found.mean(axis=1)
+        by_path = _traced_paths(scene, tracer, points[block], views[block], lights, traced)
+        radiance[block] = by_path.mean(axis=1)
     return radiance
 
 
@@ -197,18 +191,18 @@ def estimate(
     radiance = np.zeros((len(points), 3, len(lights)), dtype=np.float32)
     variance = np.zeros_like(radiance)
     for block in _blocks(scene, points, lights):
-        found = _traced_paths(scene, tracer, points[block], views[block], lights, traced)
-        radiance[block] = found.mean(axis=1)
-        variance[block] = _variance_of_mean(found)
+        by_path = _traced_paths(scene, tracer, points[block], views[block], lights, traced)
+        radiance[block] = by_path.mean(axis=1)
+        variance[block] = _variance_of_mean(by_path)
     return radiance, variance
 
 
-def _variance_of_mean(found: Float32) -> Float32:
+def _variance_of_mean(by_path: Float32) -> Float32:
     """Variance of the mean over the paths, axis 1."""
-    n_paths = found.shape[1]
+    n_paths = by_path.shape[1]
     if n_paths == 1:
-        return found[:, 0] ** 2
-    return found.var(axis=1, ddof=1) / n_paths
+        return by_path[:, 0] ** 2
+    return by_path.var(axis=1, ddof=1) / n_paths
 
 
 @dataclass(frozen=True)
@@ -249,7 +243,7 @@ def _traced_paths(
     paths = _Paths(points[row], views[row], np.ones((len(row), 3)), np.arange(len(row)))
     for bounce in range(options.bounces):
         numbers = np.zeros((len(paths.row), 4))
-        _fill_numbers(keys, paths.row, options.paths, bounce, numbers)
+        fill_numbers(keys, paths.row, options.paths, bounce, numbers)
         paths = _next(scene, tracer, paths, numbers, roulette=bounce >= ROULETTE_FROM)
         if len(paths.row) == 0:
             break
@@ -292,106 +286,8 @@ def _next(
     )
 
 
-def draw_directions(views: Array, lobes: Array, numbers: Array) -> tuple[Array, Array]:
-    r"""Random directions for a point's BRDF, and their density.
-
-    Where there is a lobe, half of the directions are mirror images of the viewer in
-    microfacets of density :math:`D(h) h_z`, which makes theirs
-    :math:`D(h) h_z / (4\, v \cdot h)`; all others are as dense as
-    :math:`\cos\theta / \pi`.
-
-    Parameters
-    ----------
-    views : (n, 3) float64
-        Unit directions to the viewer, shading frame.
-    lobes : (n, 2) float64
-        From `Material.lobe`.
-    numbers : (n, 3 or more) float64
-        Independent and uniform in [0, 1).
-
-    Returns
-    -------
-    outgoing : (n, 3) float64
-        Unit directions, shading frame; may lie below the horizon.
-    density : (n,) float64
-        Per solid angle, > 0.
-
-    Examples
-    --------
-    Straight up without a lobe: cos 0 / pi.
-
-    >>> up, middle = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 0.9]])
-    >>> draw_directions(up, np.zeros((1, 2)), middle)[1].round(4)
-    array([0.3183])
-    """
-    shiny = lobes[:, 0] > 0.0
-    alphas = np.where(shiny[:, None], lobes, 1.0)
-    outgoing = _cosine_directions(numbers[:, :2])
-    mirrored = shiny & (numbers[:, 2] < 0.5)
-    halves = _microfacets(alphas[mirrored], numbers[mirrored, :2])
-    facing = np.sum(views[mirrored] * halves, axis=1, keepdims=True)
-    outgoing[mirrored] = 2.0 * facing * halves - views[mirrored]
-    cosine_density = np.maximum(outgoing[:, 2], 0.0) / np.pi
-    halves, cosine = half_vectors(views, outgoing)
-    facets = ggx_density(halves, alphas)[:, 0] * np.abs(halves[:, 2])
-    mirror_density = facets / np.maximum(4.0 * cosine[:, 0], SMALLEST_DENOMINATOR)
-    mixed = 0.5 * (cosine_density + mirror_density)
-    density = np.where(shiny, mixed, cosine_density)
-    return outgoing, np.maximum(density, SMALLEST_DENOMINATOR)
-
-
-def _microfacets(alphas: Array, numbers: Array) -> Array:
-    """Unit normals of density D(h) h_z of GGX: slopes stretched by the roughness."""
-    slope = np.sqrt(numbers[:, 0] / (1.0 - numbers[:, 0]))
-    turn = 2.0 * np.pi * numbers[:, 1]
-    x, y = slope * np.cos(turn) * alphas[:, 0], slope * np.sin(turn) * alphas[:, 1]
-    normals = np.stack([x, y, np.ones_like(x)], axis=1)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-
-
-def _cosine_directions(numbers: Array) -> Array:
-    """Directions above the horizon, as dense as their cosine, from the unit square."""
-    radius, turn = np.sqrt(numbers[:, 0]), 2.0 * np.pi * numbers[:, 1]
-    height = np.sqrt(np.maximum(1.0 - numbers[:, 0], 0.0))
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
-
-
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _Values = NDArray[Any]
-
-
-@_compiled
-def _mixed(state: Any) -> Any:
-    """One step of the generator splitmix64."""
-    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return state ^ (state >> np.uint64(31))
-
-
-@_compiled
-def _fill_numbers(
-    keys: _Values, row: _Values, n_paths: int, bounce: int, numbers: _Values
-) -> None:
-    """Four numbers in [0, 1) for each path; the first three stratified on the first bounce."""
-    golden = np.uint64(0x9E3779B97F4A7C15)
-    unit = 1.0 / 9007199254740992.0  # 2^-53
-    for n in range(len(row)):
-        state = np.uint64(bounce + 1)
-        for c in range(keys.shape[1]):
-            state = _mixed(state + golden + keys[row[n], c])
-        path = row[n] % n_paths
-        if bounce > 0:
-            state = _mixed(state + golden * np.uint64(path + 1))
-        for c in range(4):
-            state = _mixed(state + golden)
-            numbers[n, c] = np.float64(state >> np.uint64(11)) * unit
-        if bounce == 0:
-            # The R2 sequence of Roberts, turned by the point's own random offsets.
-            numbers[n, 0] = (numbers[n, 0] + 0.7548776662466927 * path) % 1.0
-            numbers[n, 1] = (numbers[n, 1] + 0.5698402909980532 * path) % 1.0
-            # Paths of the two densities take turns; one without a partner draws its own.
-            if path ^ 1 < n_paths:
-                numbers[n, 2] = (0.5 * numbers[n, 2] + 0.5 * path) % 1.0
 
 
 @_compiled
@@ -424,7 +320,7 @@ def largest_form_factor(mesh: SurfaceMesh) -> float:
     Returns
     -------
     float
-        In [0, 1]; over points spread evenly, each with `TRIAL_DIRECTIONS` rays, and
+        In [0, 1]; over points spread evenly, each with `SAMPLE_DIRECTIONS` rays, and
         three standard errors of their fraction above what was found.
 
     Examples
@@ -434,19 +330,19 @@ def largest_form_factor(mesh: SurfaceMesh) -> float:
     0.0
     """
     rng = np.random.default_rng(0)
-    face, barycentric = spread_points(mesh, TRIAL_POINTS, rng)
+    face, barycentric = spread_points(mesh, SAMPLE_POINTS, rng)
     # Any material will do: only the smooth frames count.
     points = surface_points(mesh, Lambert(Constant((0.5,))), face, barycentric)
     tracer = RayTracer(mesh)
-    row = np.repeat(np.arange(TRIAL_POINTS), TRIAL_DIRECTIONS)
-    outgoing = _cosine_directions(rng.random((len(row), 2)))
+    row = np.repeat(np.arange(SAMPLE_POINTS), SAMPLE_DIRECTIONS)
+    outgoing = cosine_directions(rng.random((len(row), 2)))
     directions = np.einsum("nij,ni->nj", points.surface_from_world[row], outgoing)
     origins = (points.position + tracer.start_offset * points.face_normal)[row]
     hits = tracer.first_hits(origins, directions)
     above = np.einsum("nj,nj->n", points.face_normal[row], directions) > 0.0
-    filled = (hits.hit & above).reshape(TRIAL_POINTS, -1).mean(axis=1)
+    filled = (hits.hit & above).reshape(SAMPLE_POINTS, -1).mean(axis=1)
     largest = float(filled.max())
-    error = np.sqrt(largest * (1.0 - largest) / TRIAL_DIRECTIONS)
+    error = np.sqrt(largest * (1.0 - largest) / SAMPLE_DIRECTIONS)
     return min(1.0, largest + 3.0 * float(error))
 
 
@@ -473,8 +369,8 @@ def largest_albedo(material: Material) -> float:
     if steepness(material) > STEEPEST:
         return 1.0
     rng = np.random.default_rng(0)
-    uv, views = rng.random((64, 2)), _cosine_directions(rng.random((64, 2)))
-    outgoing = _cosine_directions(rng.random((4096, 2)))
+    uv, views = rng.random((64, 2)), cosine_directions(rng.random((64, 2)))
+    outgoing = cosine_directions(rng.random((4096, 2)))
     lights = np.broadcast_to(outgoing.T, (64, 3, 4096)).astype(material.precision)
     every = np.ones((64, 4096), dtype=bool)
     values = material.evaluate_lights(

@@ -36,11 +36,11 @@ from capture_sim.render import (
     lit_pairs,
     reflectance_of_pairs,
     render_view,
-    sample_view,
     shade,
     traced_lights,
 )
 from capture_sim.scene import load_scene, parse_scene
+from capture_sim.view_samples import sample_view
 from capture_sim.write import write_capture
 
 DIRECT = EffectOptions(simulate=("antialiasing", "near_lights", "shadows"))

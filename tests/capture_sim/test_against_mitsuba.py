@@ -17,9 +17,10 @@ from capture_sim.effects import interreflection
 from capture_sim.files import write_ply
 from capture_sim.model import EffectOptions, ImageOptions
 from capture_sim.rays import RayTracer, camera_rays, towards_camera
-from capture_sim.render import sample_view, shade
+from capture_sim.render import shade
 from capture_sim.scene import parse_scene
 from capture_sim.shading import direct_light
+from capture_sim.view_samples import sample_view
 
 ONE_RAY = ImageOptions(samples_per_side=1, edge_samples_per_side=1)
 # Mitsuba lifts shadow rays by 9e-5 of one unit plus the largest coordinate: in metres a

@@ -7,14 +7,15 @@ import pytest
 
 from capture_sim.arrival import LightArrays
 from capture_sim.dome import fibonacci
-from capture_sim.effects import interreflection, simulated
+from capture_sim.effects import directions, interreflection, simulated
 from capture_sim.materials import make_material
 from capture_sim.model import Blocks, EffectOptions
 from capture_sim.rays import RayTracer, towards_camera
-from capture_sim.render import sample_view, shade
+from capture_sim.render import shade
 from capture_sim.scene import parse_scene
 from capture_sim.shading import direct_light
 from capture_sim.stopwatch import Stopwatch
+from capture_sim.view_samples import sample_view
 
 
 def bowl(material, *, paths=16, bounces=8, lights=None):
@@ -163,7 +164,7 @@ def test_any_number_of_paths_is_unbiased(n_paths, rng):
     n_points = 20_000
     keys = rng.random((n_points, 6)).repeat(n_paths, axis=0).view(np.uint64)
     numbers = np.zeros((len(keys), 4))
-    interreflection._fill_numbers(keys, np.arange(len(keys)), n_paths, 0, numbers)
+    directions.fill_numbers(keys, np.arange(len(keys)), n_paths, 0, numbers)
     views = np.tile([0.6, 0.1, np.sqrt(1 - 0.37)], (len(keys), 1))
     outgoing, density = interreflection.draw_directions(
         views, np.full((len(keys), 2), 0.2), numbers

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture_sim.effects.interreflection import draw_directions
+from capture_sim.effects.directions import draw_directions
 from capture_sim.materials import make_material, material_presets, read_rgl
 
 MEASURED = ("paper_white", "satin_rosaline", "cc_ibiza_sunset", "cc_iris_purple_gem",

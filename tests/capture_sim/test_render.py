@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture_sim import render
+from capture_sim import render, view_samples
 from capture_sim.effects import near_lights
 from capture_sim.materials import make_material
 from capture_sim.model import Blocks
 from capture_sim.rays import RayTracer, camera_rays, towards_camera
-from capture_sim.render import sample_view, shade
+from capture_sim.render import shade
 from capture_sim.scene import EffectOptions, ImageOptions, parse_scene
 from capture_sim.surface import surface_points
 from capture_sim.truth import area_uniform_points, lights_visible
+from capture_sim.view_samples import sample_view
 from capture_sim.visibility import Nodes, TracedLights, trace_lights
 
 ONE_RAY = ImageOptions(samples_per_side=1, edge_samples_per_side=1)
@@ -252,7 +253,9 @@ def test_outlines_are_found_as_by_searching_everywhere(thing, monkeypatch):
     )
     tracer = RayTracer(scene.mesh)
     found = sample_view(scene, tracer, scene.cameras[0])
-    monkeypatch.setattr(render, "_near_outline", lambda found, *_: found.coverage >= 0.0)
+    monkeypatch.setattr(
+        view_samples, "_near_outline", lambda searched, *_: searched.coverage >= 0.0
+    )
     everywhere = sample_view(scene, tracer, scene.cameras[0])
     assert ((found.coverage > 0) & (found.coverage < 1)).sum() > 50
     assert (found.coverage == everywhere.coverage).all()

@@ -13,10 +13,11 @@ from capture_sim.materials import make_material
 from capture_sim.materials.translucent import Dipole
 from capture_sim.model import EffectOptions
 from capture_sim.rays import RayTracer
-from capture_sim.render import sample_view, shade
+from capture_sim.render import shade
 from capture_sim.scene import parse_scene
 from capture_sim.stopwatch import Stopwatch
 from capture_sim.surface import surface_points
+from capture_sim.view_samples import sample_view
 
 DIRECT = ("near_lights", "shadows")
 
