@@ -118,11 +118,11 @@ def search(
     A turned function is found again:
 
     >>> from reflfield.sphere.coupling import couple, rotate_coupled
-    >>> from reflfield.sphere.rotations import matrix_from_euler
+    >>> from scipy.spatial.transform import Rotation
     >>> from reflfield.sphere.wigner import rotation_blocks
     >>> rng = np.random.default_rng(0)
     >>> target = couple(rng.standard_normal((1, 9, 9)).astype(np.float32))
-    >>> truth = matrix_from_euler(0.3, 0.5, -0.2)[None]
+    >>> truth = Rotation.from_euler("ZYZ", [[0.3, 0.5, -0.2]]).as_matrix()
     >>> found = search(rotate_coupled(target, rotation_blocks(truth, 5)), target)
     >>> bool(np.abs(found.rotations - truth).max() < 1e-3), float(found.score[0].round(4))
     (True, 1.0)

@@ -54,14 +54,6 @@ def first_tap(coordinate: float, side: int) -> tuple[int, float]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _squares(directions: NDArray[np.floating], out: NDArray[np.float64]) -> None:
-    for i in range(directions.shape[0]):
-        u, v = square_from_xyz(directions[i, 0], directions[i, 1], directions[i, 2])
-        out[i, 0] = u
-        out[i, 1] = v
-
-
-@numba.njit(cache=True, nogil=True)
 def _taps(
     directions: NDArray[np.floating],
     side: int,
@@ -83,38 +75,8 @@ def _taps(
         weights[i, 3] = s * t
 
 
-def square_from_direction(directions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Equal-area concentric square coordinates of directions.
-
-    Parameters
-    ----------
-    directions : (n, 3) float
-        Unit vectors; those with z < 0 are taken to the horizon.
-
-    Returns
-    -------
-    (n, 2) float64
-        Coordinates in [-1, 1]; the zenith is (0, 0).
-
-    Raises
-    ------
-    ShapeError
-        If the shape is not (n, 3).
-
-    Examples
-    --------
-    >>> square_from_direction(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]))
-    array([[0., 0.],
-           [1., 0.]])
-    """
-    check_shape("directions", directions, (None, 3))
-    out = np.zeros((len(directions), 2))
-    _squares(directions, out)
-    return out
-
-
 def direction_from_square(square: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Directions of concentric square coordinates; inverse of `square_from_direction`.
+    """Directions of concentric square coordinates; inverse of `square_from_xyz`.
 
     Parameters
     ----------

@@ -63,38 +63,13 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     return flat.reshape(*m.shape[:-2], 4)
 
 
-def matrix_from_euler(alpha: ArrayLike, beta: ArrayLike, gamma: ArrayLike) -> Array:
-    """Rotation matrices ``Rz(alpha) @ Ry(beta) @ Rz(gamma)``.
-
-    Parameters
-    ----------
-    alpha, beta, gamma : (...) array_like
-        Angles in radians, broadcast against each other.
-
-    Returns
-    -------
-    (..., 3, 3) float64
-
-    Examples
-    --------
-    The z axis goes to the direction with polar angle beta and azimuth alpha:
-
-    >>> matrix_from_euler(np.pi / 2, np.pi / 2, 0.3)[:, 2].round(6) + 0.0
-    array([0., 1., 0.])
-    """
-    a, b, c = np.broadcast_arrays(alpha, beta, gamma)
-    angles = np.stack([a, b, c], axis=-1).astype(np.float64)
-    flat = Rotation.from_euler("ZYZ", angles.reshape(-1, 3)).as_matrix()
-    return flat.reshape(*a.shape, 3, 3)
-
-
 def rotation_angle(matrix: ArrayLike) -> Array:
     """Angle of rotation of each matrix, radians, accurate near zero.
 
     Examples
     --------
-    >>> float(rotation_angle(matrix_from_euler(0.0, 0.25, 0.0)).round(12))
-    0.25
+    >>> float(rotation_angle([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).round(12))
+    1.570796326795
     """
     m = np.asarray(matrix, dtype=np.float64)
     flat = Rotation.from_matrix(m.reshape(-1, 3, 3)).magnitude()

@@ -1,4 +1,4 @@
-r"""Wigner-d matrices and rotation of real harmonic coefficients.
+r"""Wigner-d functions, and the matrices that rotate real harmonic coefficients.
 
 Complex convention: :math:`D^j_{mn}(R) = e^{-im\alpha} d^j_{mn}(\beta) e^{-in\gamma}` with
 ``R = Rz(alpha) @ Ry(beta) @ Rz(gamma)``; the coefficients of the turned
@@ -26,11 +26,6 @@ from reflfield.util.validation import check_shape
 
 # Rows of stored d are whole cache lines of single precision, for vector instructions.
 LINE = 16
-MAX_DEGREE = 256
-# Near beta = 0 and pi the two solutions of the recursion grow alike and rounding grows
-# with the square of the degree; there the matrix is made as a product of two others.
-DEGENERATE_SINE = 0.1
-
 
 # Cosine and sine of an angle.
 Turn = tuple[float, float]
@@ -46,92 +41,6 @@ def block_offsets(degree_limit: int) -> NDArray[np.int64]:
     """
     sizes = (2 * np.arange(degree_limit, dtype=np.int64) + 1) ** 2
     return np.concatenate([[0], np.cumsum(sizes)])
-
-
-def wigner_d(degree: int, beta: float) -> NDArray[np.float64]:
-    r"""Matrix :math:`d^j_{mn}(\beta)` of one degree.
-
-    Parameters
-    ----------
-    degree : int
-        0 .. 256.
-    beta : float
-        Angle, radians.
-
-    Returns
-    -------
-    (2 * degree + 1, 2 * degree + 1) float64
-        Row ``m + degree``, column ``n + degree``. Orthogonal to 1e-12 at degree 256.
-
-    Raises
-    ------
-    InputError
-        If the degree is out of range or the angle is not finite.
-
-    Examples
-    --------
-    >>> wigner_d(1, np.pi / 3).round(3)
-    array([[ 0.75 ,  0.612,  0.25 ],
-           [-0.612,  0.5  ,  0.612],
-           [ 0.25 , -0.612,  0.75 ]])
-    """
-    if not 0 <= degree <= MAX_DEGREE:
-        raise InputError(f"degree: expected 0 to {MAX_DEGREE}, received {degree}")
-    if not np.isfinite(beta):
-        raise InputError(f"beta: expected a finite angle, received {beta}")
-    if abs(np.sin(beta)) < DEGENERATE_SINE:
-        return _ascend(degree, beta + 1.0) @ _ascend(degree, 1.0).T
-    return _ascend(degree, beta)
-
-
-def _ascend(degree: int, beta: float) -> NDArray[np.float64]:
-    """The recursion from degree 0 upwards."""
-    older = np.zeros((1, 1))
-    newer = np.ones((1, 1))
-    edge = np.ones(1)
-    for j in range(1, degree + 1):
-        edge = _edge_row(edge, j, beta)
-        older, newer = newer, _next_degree(older, newer, edge, j, beta)
-    return newer
-
-
-def _edge_row(edge: NDArray[np.float64], j: int, beta: float) -> NDArray[np.float64]:
-    """Row d^j_{j,n} from row d^{j-1}_{j-1,n}."""
-    orders = np.arange(-j + 1, j)
-    row = np.zeros(2 * j + 1)
-    growth = np.sqrt(2.0 * j * (2.0 * j - 1.0) / ((j + orders) * (j - orders)))
-    row[1:-1] = edge * growth * (-0.5 * np.sin(beta))
-    row[0] = np.sin(0.5 * beta) ** (2 * j)
-    row[-1] = np.cos(0.5 * beta) ** (2 * j)
-    return row
-
-
-def _next_degree(
-    older: NDArray[np.float64],
-    newer: NDArray[np.float64],
-    edge: NDArray[np.float64],
-    j: int,
-    beta: float,
-) -> NDArray[np.float64]:
-    """Matrix of degree j from those of degrees j - 2 and j - 1 and its last row."""
-    matrix = np.zeros((2 * j + 1, 2 * j + 1))
-    orders = np.arange(-j, j + 1)
-    sign = np.where((orders - j) % 2, -1.0, 1.0)
-    matrix[-1] = edge
-    matrix[:, -1] = sign * edge
-    matrix[:, 0] = edge[::-1]
-    matrix[0] = (sign * edge)[::-1]
-    i = j - 1
-    inner = orders[1:-1].astype(np.float64)
-    now, last = j**2 - inner**2, np.maximum(i**2 - inner**2, 0.0)
-    centre = i * j * np.cos(beta) - np.outer(inner, inner)
-    total = (2 * i + 1) * centre * newer
-    if i > 0:
-        total[1:-1, 1:-1] -= j * np.sqrt(np.outer(last, last))[1:-1, 1:-1] * older
-        matrix[1:-1, 1:-1] = total / (i * np.sqrt(np.outer(now, now)))
-    else:
-        matrix[1, 1] = np.cos(beta)
-    return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,9 +104,9 @@ def degree_tables(degree_limit: int, dtype: str = "float32") -> DegreeTables:
 def _on_cache_lines(array: NDArray[np.floating]) -> NDArray[np.floating]:
     """A copy that begins where a cache line does."""
     line = LINE * 4
-    room = np.zeros(array.nbytes + line, np.uint8)
-    first = -room.ctypes.data % line
-    out = room[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+    buffer = np.zeros(array.nbytes + line, np.uint8)
+    first = -buffer.ctypes.data % line
+    out = buffer[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
     out[...] = array
     return out
 
@@ -434,43 +343,3 @@ def rotation_blocks(
     out = np.zeros((len(matrices), int(block_offsets(degree_limit)[-1])), dtype)
     _real_blocks(matrices, tables.row_start, tables.recursion, tables.edge, out)
     return out
-
-
-def rotate_coefficients(coefficients: ArrayLike, rotations: ArrayLike) -> NDArray[np.float64]:
-    r"""Coefficients of the turned functions :math:`f(R^T \omega)`.
-
-    Parameters
-    ----------
-    coefficients : (n, band_limit**2) or (band_limit**2,) array_like
-        Real harmonics, index ``ell * ell + ell + m``; one row serves all rotations.
-    rotations : (n, 3, 3) array_like
-        Proper rotations, active.
-
-    Returns
-    -------
-    (n, band_limit**2) float64
-
-    Raises
-    ------
-    ShapeError
-        If the last axis is not the square of a band limit.
-
-    Examples
-    --------
-    A half turn about z negates x and y:
-
-    >>> rotate_coefficients([0.0, 1.0, 2.0, 3.0], [np.diag([-1.0, -1.0, 1.0])]).round(12)
-    array([[ 0., -1.,  2., -3.]])
-    """
-    values = np.atleast_2d(np.asarray(coefficients, dtype=np.float64))
-    band_limit = round(np.sqrt(values.shape[1]))
-    check_shape("coefficients", values, (None, max(band_limit, 1) ** 2))
-    blocks = rotation_blocks(rotations, band_limit)
-    offsets = block_offsets(band_limit)
-    values = np.broadcast_to(values, (len(blocks), values.shape[1]))
-    parts = []
-    for j in range(band_limit):
-        size = 2 * j + 1
-        block = blocks[:, offsets[j] : offsets[j + 1]].reshape(-1, size, size)
-        parts.append(np.einsum("nij,nj->ni", block, values[:, j * j : (j + 1) ** 2]))
-    return np.concatenate(parts, axis=1)

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numba  # without its cache: this file is imported under more than one name
 import numpy as np
 import scipy.fft
+from scipy.spatial.transform import Rotation
 
 from reflfield.alignment.correlation import spectrum
 from reflfield.sphere.hemisphere import first_tap, square_from_xyz
-from reflfield.sphere.rotations import matrix_from_euler
-from reflfield.sphere.wigner import block_offsets, rotation_blocks, wigner_d
+from reflfield.sphere.wigner import block_offsets, degree_tables, fill_wigner_d, rotation_blocks
 
 # Rotations of the exact series worked on at once: their Wigner matrices take 0.3 GB at L = 16.
 SERIES_AT_ONCE = 2048
@@ -33,11 +33,17 @@ def grid_angles(band_limit):
     return np.pi * np.arange(count) / band_limit, np.pi * (np.arange(count) + 0.5) / count
 
 
+def rotations_zyz(alpha, beta, gamma):
+    """(n, 3, 3) rotations Rz(alpha) @ Ry(beta) @ Rz(gamma) of arrays of angles."""
+    angles = np.stack([alpha.ravel(), beta.ravel(), gamma.ravel()], axis=1)
+    return Rotation.from_euler("ZYZ", angles).as_matrix()
+
+
 def paper_grid(band_limit):
     """(8 L^3, 3, 3) rotations of the paper's grid: beta slowest, then gamma, then alpha."""
     alpha, beta = grid_angles(band_limit)
     b, c, a = np.meshgrid(beta, alpha, alpha, indexing="ij")
-    return matrix_from_euler(a.ravel(), b.ravel(), c.ravel())
+    return rotations_zyz(a, b, c)
 
 
 def parts(n, size):
@@ -104,10 +110,16 @@ def separation_kernel(band_limit, dtype="float32"):
     """(L, 2L-1, L, 2L): d^ell_mn(beta) of the paper's grid, [m >= 0, n, ell, beta]."""
     _, beta = grid_angles(band_limit)
     kernel = np.zeros((band_limit, 2 * band_limit - 1, band_limit, len(beta)), dtype)
-    for ell in range(band_limit):
-        n = slice(band_limit - 1 - ell, band_limit + ell)
-        for k, angle in enumerate(beta):
-            kernel[: ell + 1, n, ell, k] = wigner_d(ell, angle)[ell:]
+    tables = degree_tables(band_limit, "float64")
+    for k, angle in enumerate(beta):
+        d = np.zeros(tables.recursion.shape[1])
+        turn = (np.cos(angle), np.sin(angle))
+        fill_wigner_d(turn, tables.row_start, tables.recursion, tables.edge, d)
+        for ell in range(band_limit):
+            rows = d[tables.row_start[ell] : tables.row_start[ell + 1]].reshape(ell + 1, -1)
+            centre = rows.shape[1] // 2
+            n = slice(band_limit - 1 - ell, band_limit + ell)
+            kernel[: ell + 1, n, ell, k] = rows[:, centre - ell : centre + ell + 1]
     return kernel
 
 

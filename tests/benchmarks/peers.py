@@ -9,9 +9,7 @@ from __future__ import annotations
 import importlib.util
 
 import numpy as np
-from alignment.paper_forms import both_signs, complex_coefficients
-
-from reflfield.sphere.rotations import matrix_from_euler
+from alignment.paper_forms import both_signs, complex_coefficients, rotations_zyz
 
 
 def missing(name):
@@ -51,7 +49,7 @@ class S2fft:
         beta = s2_samples.thetas(band_limit, "mw")
         alpha = 2 * np.pi * np.arange(2 * band_limit - 1) / (2 * band_limit - 1)
         c, b, a = np.meshgrid(alpha, beta, alpha, indexing="ij")
-        self.rotations = matrix_from_euler(a.ravel(), b.ravel(), c.ravel())
+        self.rotations = rotations_zyz(a, b, c)
 
     def coefficients(self, real):
         """The library's form of real functions (..., L^2): complex, [ell, m]."""
@@ -106,7 +104,7 @@ class Pysofft:
         axes = angles["gamma"], angles["alpha"], angles["beta"]
         c, a, b = np.meshgrid(*axes, indexing="ij")
         # Its cross-correlation turns the other way round than ours.
-        self.rotations = matrix_from_euler(-a.ravel(), -b.ravel(), -c.ravel())
+        self.rotations = rotations_zyz(-a, -b, -c)
 
     def coefficients(self, real):
         """The library's form of real functions (..., L^2): complex, m >= 0, m slowest."""
