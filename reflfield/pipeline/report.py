@@ -65,7 +65,7 @@ def report_content(
         _alignment_section(job),
         *_truth_sections(scores, compared.get("truth")),
         _compression_section(job),
-        sections.accounts_section(list(accounts_of(job))),
+        sections.bookkeeping_section(list(accounts_of(job))),
         sections.stages_section([_stage(record) for record in job.stages.records]),
         sections.run_section(plain(job.options), versions()),
     ]
@@ -224,7 +224,7 @@ def _choices_sections(job: Job) -> Iterator[Section]:
         )
         pairs.append(relit.measured_in(measured))
         tried.append(
-            sections.TriedField(
+            sections.CandidateRun(
                 _variant(
                     candidate.name,
                     {"heldout": measured},
@@ -234,7 +234,7 @@ def _choices_sections(job: Job) -> Iterator[Section]:
                 unseen=_mean_of(folder / "truth.json"),
             )
         )
-    yield sections.choices_section(tried, found.taken.name, words, pairs)
+    yield sections.candidate_runs_section(tried, found.taken.name, words, pairs)
 
 
 def _mean_of(metrics: Path) -> dict[str, float] | None:

@@ -10,10 +10,10 @@ import numpy as np
 from reflfield.pipeline import comparison
 from reflfield.pipeline.compared_photographs import frame_sets
 from reflfield.pipeline.context import Job
-from reflfield.report.sections import Account
+from reflfield.report.sections import CountedItems
 
 
-def accounts_of(job: Job) -> Iterator[Account]:
+def accounts_of(job: Job) -> Iterator[CountedItems]:
     """Count what went into each stage of a finished run, and what became of it.
 
     Totals come from the capture and the texel table, parts from what the stages have
@@ -26,7 +26,7 @@ def accounts_of(job: Job) -> Iterator[Account]:
 
     Yields
     ------
-    Account
+    CountedItems
     """
     counts = {record.name: record.counts for record in job.stages.records}
     yield _photographs(job, counts["observations"])
@@ -36,9 +36,9 @@ def accounts_of(job: Job) -> Iterator[Account]:
     yield _frames(job)
 
 
-def _photographs(job: Job, projected: dict[str, Any]) -> Account:
+def _photographs(job: Job, projected: dict[str, Any]) -> CountedItems:
     """Photographs of the capture: projected, held out and compared, or neither."""
-    return Account(
+    return CountedItems(
         "observations",
         "photographs",
         len(job.capture.photographs),
@@ -50,7 +50,7 @@ def _photographs(job: Job, projected: dict[str, Any]) -> Account:
     )
 
 
-def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
+def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> CountedItems:
     """One sample for each texel and photograph: fitted, unseen, shadowed, below the horizon."""
     observed, pairs = job.observed, job.observed.pairs.astype(np.float32)
     seen = observed.views.astype(np.float32) @ pairs
@@ -61,7 +61,7 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
     shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
     mixed = shade["samples at edges of shadows"]
     shown = shade["samples in shadow"] - mixed
-    return Account(
+    return CountedItems(
         "compression",
         "samples",
         len(job.texels) * len(job.training.photographs),
@@ -81,7 +81,7 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> Account:
     )
 
 
-def _values(job: Job, projected: dict[str, Any]) -> Account:
+def _values(job: Job, projected: dict[str, Any]) -> CountedItems:
     """Three values for each photograph and texel that its camera sees: measured or not."""
     pairs = job.observed.pairs.sum(axis=1)
     names = {
@@ -92,7 +92,7 @@ def _values(job: Job, projected: dict[str, Any]) -> Account:
         "dark": "of a colour that the light has not: left out",
         "unlit": "the light gives nothing there",
     }
-    return Account(
+    return CountedItems(
         "observations",
         "values",
         3 * int(job.view_seen.sum(axis=0) @ pairs),
@@ -100,19 +100,19 @@ def _values(job: Job, projected: dict[str, Any]) -> Account:
     )
 
 
-def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
+def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[CountedItems]:
     """Texels of the atlas through completion, alignment and compression."""
     n = len(job.texels)
     completed = counts["completion"]
     unseen = completed["texels without samples"]
-    yield Account(
+    yield CountedItems(
         "completion",
         "texels",
         n,
         {"completed": completed["texels completed"], "without samples": unseen},
     )
     aligned = counts["alignment"]
-    yield Account(
+    yield CountedItems(
         "alignment",
         "texels",
         n,
@@ -123,7 +123,7 @@ def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
         },
     )
     fitted = counts["compression"]
-    yield Account(
+    yield CountedItems(
         "compression",
         "texels",
         n,
@@ -134,8 +134,8 @@ def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[Account]:
     )
 
 
-def _frames(job: Job) -> Account:
-    """Frames that are compared, from the metrics that were written."""
+def _frames(job: Job) -> CountedItems:
+    """Photographs that are compared, from the metrics that were written."""
     names = {"heldout": "held out", "truth": "unseen and simulated"}
     sets, parts = frame_sets(job), {}
     for name, frames in sets.items():
@@ -147,4 +147,4 @@ def _frames(job: Job) -> Account:
         if measured.not_measured:
             parts[f"{names[name]}, without an object pixel"] = len(measured.not_measured)
     total = sum(len(frames.photographs) for frames in sets.values())
-    return Account("comparison", "frames", total, parts)
+    return CountedItems("comparison", "photographs", total, parts)

@@ -1,10 +1,10 @@
-"""One self-contained web page that says how good a result is, and why.
+"""One self-contained web page on the quality of a result.
 
 The page is composed of `Section` s; builders for the usual ones are in
-`reflfield.report.sections`. Pictures are embedded, there is no script and
-no reference to anything outside of the file; its content security policy
+`reflfield.report.sections`. Images are embedded; there is no script and
+no reference to anything outside of the file, and its content security policy
 forbids loading any. All texts are escaped: names of captures and photographs
-come from elsewhere.
+are not trusted.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Pictures side by side under one caption that says what to look for.
+    """Images side by side under one caption that says what to look for.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header; the caption says what to look for.
+    """Rows under a header, with a caption.
 
     Attributes
     ----------

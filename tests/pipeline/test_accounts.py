@@ -35,7 +35,7 @@ def test_all_accounts_add_up(finished_job):
     assert values.total == values.parts["measured"] == 3 * 5 * finished_job.view_seen.sum()
     samples = accounts["compression", "samples"]
     assert samples.total == 45 * len(finished_job.texels)
-    assert accounts["comparison", "frames"].total == 3
+    assert accounts["comparison", "photographs"].total == 3
 
 
 def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):

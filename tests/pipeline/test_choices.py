@@ -122,7 +122,7 @@ class TestWhatATrialLeaves:
 
     def test_all_are_in_the_report_with_what_they_measured(self, tried):
         page = (tried / "report" / "index.html").read_text()
-        section = page[page.index("<h2>Choices</h2>") :].split("</section>")[0]
+        section = page[page.index("<h2>Model selection</h2>") :].split("</section>")[0]
         for name in NAMES:
             metrics = json.loads(
                 (tried / "stages" / "choices" / name / "heldout.json").read_text()
@@ -135,7 +135,7 @@ class TestWhatATrialLeaves:
             assert f'alt="FLIP error {name}"' in section
         taken = records(tried)["choices"]["counts"]["taken"]
         assert f'<tr class="emphasised"><td>{taken}</td>' in section
-        assert "unseen views and lights, which had no part in the decision" in section
+        assert "unseen views and lights, which had no part in the selection" in section
 
     def test_stages_before_what_is_open_are_shared(self, tried):
         for stage, file, n_made in (

@@ -71,7 +71,8 @@ def page(page_text):
 def test_every_section_is_there_with_figures_and_captions(page):
     text = " ".join(page.text)
     for title in (
-        "Held-out frames", "Silhouettes and hull", "Atlas", "Coverage", "Normals and tangents",
+        "Held-out photographs", "Silhouettes and hull", "Atlas", "Coverage",
+        "Normals and tangents",
         "Alignment", "Against the truth", "Compression", "Stages", "Options and versions",
     ):  # fmt: skip
         assert text.count(title) >= 2, f"{title}: heading and navigation"

@@ -41,7 +41,7 @@ def test_frames_of_one_name_stay_apart_and_others_are_refused(rng, samples):
     for figure, metrics in zip(figures, comparison.frames[::-1], strict=False):
         assert figure.title == "0001"
         assert f"PSNR {metrics.psnr_ldr:.2f} dB" in figure.caption
-    with pytest.raises(InputError, match=r"pairs: expected frame '0001'.*'heldout_000'"):
+    with pytest.raises(InputError, match=r"pairs: expected '0001'.*'heldout_000'"):
         sections.frames_section(comparison, pairs)
 
 
@@ -99,7 +99,7 @@ def test_fields_that_were_tried_stand_beside_the_photograph(rng, samples):
         for name, scale in (("a", 0.5), ("b", 1.0), ("c", 0.7))
     }
     tried = [
-        sections.TriedField(
+        sections.CandidateRun(
             sections.FieldVariant(name, {"held out": compare_frames(some)}, 1000, 0.1234, 0.05),
             seconds=75.0,
             unseen=None if name == "c" else compare_frames(some).mean,
@@ -108,7 +108,9 @@ def test_fields_that_were_tried_stand_beside_the_photograph(rng, samples):
     ]
 
     def section(n):
-        return sections.choices_section(tried[:n], "b", ["Why."], list(frames.values())[:n])
+        return sections.candidate_runs_section(
+            tried[:n], "b", ["Why."], list(frames.values())[:n]
+        )
 
     (compared,) = tables(section(3))
     best = f"{compare_frames(pairs).mean['psnr_ldr']:.2f}"
@@ -124,8 +126,8 @@ def test_fields_that_were_tried_stand_beside_the_photograph(rng, samples):
 
 
 def test_what_was_taken_is_among_what_was_tried():
-    with pytest.raises(InputError, match=r"tried: .* 'b' among them"):
-        sections.choices_section([], "b", [], [])
+    with pytest.raises(InputError, match=r"runs: .* 'b' among them"):
+        sections.candidate_runs_section([], "b", [], [])
 
 
 def test_a_comparison_needs_two_fields():
@@ -209,15 +211,15 @@ def test_histogram_counts_everything_in_percent():
 
 
 def test_accounts_that_do_not_add_up_are_said():
-    whole = sections.Account("capture", "photographs", 5, {"used": 3, "held out": 2})
-    lost = sections.Account("alignment", "texels", 9, {"frame found": 7})
-    section = sections.accounts_section([whole, lost])
+    whole = sections.CountedItems("capture", "photographs", 5, {"used": 3, "held out": 2})
+    lost = sections.CountedItems("alignment", "texels", 9, {"frame found": 7})
+    section = sections.bookkeeping_section([whole, lost])
     notes = [item for item in section.items if isinstance(item, Note)]
     assert [note.text for note in notes if note.is_warning] == [
-        "alignment: 2 of 9 texels are not accounted for."
+        "alignment: 2 of 9 texels are unaccounted for."
     ]
-    assert ("", "", "not accounted for", 2) in tables(section)[0].rows
-    assert len(sections.accounts_section([whole]).items) == 1
+    assert ("", "", "unaccounted", 2) in tables(section)[0].rows
+    assert len(sections.bookkeeping_section([whole]).items) == 1
 
 
 def test_rates_are_drawn_and_tabled_and_no_point_is_refused():

@@ -13,8 +13,8 @@ from reflfield.report.sections.base_surface import (
     silhouettes_section,
 )
 from reflfield.report.sections.candidate_runs import (
-    TriedField,
-    choices_section,
+    CandidateRun,
+    candidate_runs_section,
     rules_section,
 )
 from reflfield.report.sections.held_out_images import (
@@ -30,7 +30,7 @@ from reflfield.report.sections.run_summary import (
     run_section,
     stages_section,
 )
-from reflfield.report.sections.sample_counts import Account, accounts_section
+from reflfield.report.sections.sample_counts import CountedItems, bookkeeping_section
 from reflfield.report.sections.size_and_quality import (
     RatePoint,
     rate_distortion_section,
@@ -38,17 +38,17 @@ from reflfield.report.sections.size_and_quality import (
 from reflfield.report.sections.truth_scores import truth_section
 
 __all__ = [
-    "Account",
+    "CandidateRun",
+    "CountedItems",
     "FieldVariant",
     "RatePoint",
     "SilhouetteView",
     "StageRecord",
-    "TriedField",
     "ablation_section",
-    "accounts_section",
     "alignment_section",
     "atlas_section",
-    "choices_section",
+    "bookkeeping_section",
+    "candidate_runs_section",
     "comparisons_table",
     "compression_section",
     "coverage_section",

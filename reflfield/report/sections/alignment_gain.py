@@ -1,4 +1,4 @@
-"""Section on what alignment brings: two fields of one size on the same samples and frames."""
+"""Section on the gain of alignment: two fields of one size on the same photographs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from reflfield.report.sections.held_out_images import (
 
 # Fields whose files differ by less than this share count as equal in size.
 EQUAL_SIZE = 0.02
-# Width of a picture where the fields are too many for one row.
+# Width of an image where the fields are too many for one row.
 WRAPPED_WIDTH = 260
 
 
@@ -42,8 +42,8 @@ class FieldVariant:
     ----------
     name : str
         Such as "with alignment".
-    comparisons : mapping of set of frames to Comparison
-        The same sets and frames for all variants.
+    comparisons : mapping of set of photographs to Comparison
+        The same sets and photographs for all variants.
     file_bytes : int
     sample_error, cube_root_error : float
         Relative error of the field on the samples that it was made of, and of their
@@ -60,14 +60,14 @@ class FieldVariant:
 def ablation_section(
     variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]]
 ) -> Section:
-    """What alignment brings: errors of fields with and without it, and one frame of each.
+    """What alignment brings: errors of fields with and without it, and one image of each.
 
     Parameters
     ----------
     variants : sequence of FieldVariant
         The field itself first.
     pairs : sequence of iterable of FramePair
-        Of each variant, the frames of its first comparison in that order. May be empty.
+        Of each variant, the photographs of its first comparison in that order. May be empty.
 
     Returns
     -------
@@ -83,21 +83,27 @@ def ablation_section(
     items: list[Item] = [_errors_table(variants)]
     if variants[0].comparisons:
         advice = "Look at the highlights and at fine relief: without alignment they smear."
-        items += [_metrics_table(variants), middle_frame(variants, pairs, advice)]
+        items += [_metrics_table(variants), median_photograph(variants, pairs, advice)]
     sizes = [variant.file_bytes for variant in variants]
     if max(sizes) > (1 + EQUAL_SIZE) * min(sizes):
         words = "; ".join(f"{v.name} {format_bytes(v.file_bytes)}" for v in variants)
         items.append(Note(f"The files are not of one size: {words}.", is_warning=True))
     intro = (
-        "The same samples compressed twice with as many clusters, components and bits: in the "
-        "frames found, and in those of the hull."
+        "The same samples, compressed twice with the same number of clusters, components and "
+        "bits: in the aligned local frames, and in the frames of the hull."
     )
     return Section("With alignment and without", intro, tuple(items))
 
 
 def _errors_table(variants: Sequence[FieldVariant]) -> Table:
     return Table(
-        ("field", "size", "bytes", "error of the samples, %", "error of their cube roots, %"),
+        (
+            "field",
+            "size",
+            "bytes",
+            "relative error of the samples, %",
+            "relative error of their cube roots, %",
+        ),
         tuple(
             (
                 v.name,
@@ -108,36 +114,35 @@ def _errors_table(variants: Sequence[FieldVariant]) -> Table:
             )
             for v in variants
         ),
-        "Compression error: root mean square of field minus sample, over that of the samples, "
-        "as measured in the photographs that the field was made of. The cube root weighs dark "
-        "samples more.",
+        "Relative error: root mean square of field minus sample, over that of the samples of "
+        "the photographs that the field was made of. The cube root weighs dark samples more.",
     )
 
 
 def _metrics_table(variants: Sequence[FieldVariant]) -> Table:
     return Table(
-        ("frames", "field", *METRIC_HEADER),
+        ("photographs", "field", *METRIC_HEADER),
         tuple(
             (name, variant.name, *metric_cells(variant.comparisons[name].mean))
             for name in variants[0].comparisons
             for variant in variants
         ),
-        "Mean over frames that neither field has seen: higher PSNR and SSIM and lower FLIP are "
-        "better.",
+        "Mean over photographs that neither field was made of: higher PSNR and SSIM and lower "
+        "FLIP are better.",
     )
 
 
-def middle_frame(
+def median_photograph(
     variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]], advice: str
 ) -> Figure:
-    """The frame whose gain in FLIP, first over second, is the middle one, from all variants.
+    """The photograph whose gain in FLIP, first over second, is the median, with all variants.
 
     Parameters
     ----------
     variants : sequence of FieldVariant
         Two at least, with comparisons.
     pairs : sequence of iterable of FramePair
-        Of each variant, the frames of its first comparison in that order.
+        Of each variant, the photographs of its first comparison in that order.
     advice : str
         What to look at.
     """
@@ -146,8 +151,8 @@ def middle_frame(
     gains = flips[1] - flips[0]
     chosen = int(np.argsort(gains, kind="stable")[len(gains) // 2])
     rows = [
-        _row_of(chosen, frames, comparison)
-        for frames, comparison in zip(pairs, compared, strict=True)
+        _row_of(chosen, own_pairs, comparison)
+        for own_pairs, comparison in zip(pairs, compared, strict=True)
     ]
     high = flip_scale([row.error for row in rows])
     named = list(zip([v.name for v in variants], rows, strict=True))
@@ -162,13 +167,13 @@ def middle_frame(
             *(Panel(row.relit, name) for name, row in named),
             *(Panel(error_panel(row, high), f"FLIP error {name}") for name, row in named),
         ),
-        f"The frame with the middle gain of all. {metrics}. {advice}",
+        f"The held-out photograph with the median gain in FLIP. {metrics}. {advice}",
         title=rows[0].metrics.name,
-        colour_bar=ColourBar("magma", 0.0, high, "FLIP error: 0 is not distinguishable"),
+        colour_bar=ColourBar("magma", 0.0, high, "FLIP error; 0: indistinguishable"),
         min_width=0 if len(variants) == 2 else WRAPPED_WIDTH,
     )
 
 
-def _row_of(chosen: int, frames: Iterable[FramePair], comparison: Comparison) -> ComparedRow:
-    pair = next(pair for i, pair in enumerate(frames) if i == chosen)
+def _row_of(chosen: int, own_pairs: Iterable[FramePair], comparison: Comparison) -> ComparedRow:
+    pair = next(pair for i, pair in enumerate(own_pairs) if i == chosen)
     return compared_row(pair, comparison.frames[chosen], comparison.exposure)

@@ -62,9 +62,9 @@ def silhouettes_section(
     origin : str
         Where the silhouettes came from, such as "found by GrabCut".
     max_pictures : int
-        Views that agree least are shown.
+        Views with the lowest IoU are shown.
     left_out : collection of str
-        Names of views that the hull is made without.
+        Names of views that are excluded from the hull.
 
     Returns
     -------
@@ -77,10 +77,10 @@ def silhouettes_section(
     )
     figure = Figure(
         panels,
-        "The views that agree least come first. The two lines should coincide. Red areas were "
-        "carved away although the photograph shows object there (a wrong camera, or a "
-        "silhouette that is too small in another view); yellow areas are hull where the "
-        "photograph shows none.",
+        "Views with the lowest IoU come first. The two outlines should coincide. Red areas "
+        "were carved away although the photograph shows the object there (a wrong camera "
+        "pose, or a silhouette that is too small in another view); yellow areas are hull "
+        "where the photograph shows backdrop.",
         legend=_legend(
             (pictures.SILHOUETTE_COLOUR, "silhouette"),
             (pictures.HULL_COLOUR, "hull"),
@@ -102,13 +102,13 @@ def silhouettes_section(
         "Agreement per view: intersection over union; area missing from the hull and area "
         "beyond the silhouette, in percent of the silhouette.",
     )
-    intro = f"Do cameras, silhouettes and hull fit together? Silhouettes: {origin or 'given'}."
+    intro = f"Agreement of the silhouettes with the hull. Silhouettes: {origin or 'given'}."
     return Section("Silhouettes and hull", intro, (figure, table))
 
 
 def _marked(name: str, left_out: Collection[str]) -> str:
     """Name of a view, with a remark if the hull is made without it."""
-    return f"{name} (the hull is made without it)" if name in left_out else name
+    return f"{name} (excluded from the hull)" if name in left_out else name
 
 
 def _agreement(view: SilhouetteView) -> tuple[str, float, float, float]:
@@ -181,15 +181,15 @@ def atlas_section(
                 "mean over all views and lights",
             ),
         ),
-        "Charts should be few and large. The mean texture should be sharp: details seen double "
-        "or blurred point to wrong cameras or a hull that bridges hollows. Grey texels were "
-        "never observed.",
+        "Charts should be few and large. The mean texture should be sharp: doubled or "
+        "blurred details indicate wrong camera poses or a hull that fills concavities. Grey "
+        "texels were never observed.",
         min_width=280,
     )
     items: list[Item] = [figure]
     if facts:
         items.append(Table(("quantity", "value"), tuple(facts.items()), "Atlas in numbers."))
-    intro = "How the surface was cut and flattened, and what was projected onto it."
+    intro = "UV charts of the surface, and the mean of the photographs projected onto them."
     return Section("Atlas", intro, tuple(items))
 
 
@@ -223,12 +223,10 @@ def coverage_section(
                 for k, v in counts.items()
                 if v.size
             ),
-            "Texels without any view are filled from similar ones and are a guess.",
+            "Texels without any view are completed from similar texels.",
         )
     )
-    intro = (
-        "What the data say about each texel; everything else is completed from other texels."
-    )
+    intro = "Observed views and lights of each texel; the rest is completed from other texels."
     return Section("Coverage", intro, tuple(items))
 
 
@@ -246,7 +244,7 @@ def _count_figure(texel_of_pixel: ArrayLike, name: str, counts: NDArray[Any]) ->
             ),
             Panel(plot, f"distribution of {name} per texel"),
         ),
-        f"Dark regions were observed with few {name}; look for them in hollows and underneath.",
+        f"Dark texels were observed with few {name}: mostly concavities and the underside.",
         colour_bar=ColourBar("viridis", 0, most, f"{name} per texel"),
         min_width=280,
     )
@@ -257,7 +255,7 @@ def normals_section(
     local_from_world: ArrayLike,
     base_from_world: ArrayLike,
 ) -> Section:
-    """Recovered frames of reference: normals and tangents, and how far they turned.
+    """Aligned local frames: normals, tangents, and their rotation from the hull's.
 
     Parameters
     ----------
@@ -296,8 +294,8 @@ def normals_section(
         Figure(
             maps,
             "Red, green and blue are X, Y and Z, from -1 (dark) to 1 (bright); +Y is up "
-            "(OpenGL). Recovered normals should show relief that the hull lacks, and run "
-            "smoothly across charts; tangents mean something only where the material is "
+            "(OpenGL). Recovered normals should show relief that the hull lacks, and be "
+            "continuous across charts; tangents are determined only where the material is "
             "anisotropic.",
             min_width=340,
         ),
@@ -306,18 +304,18 @@ def normals_section(
                 _atlas_panel(tilted, texel_of_pixel, "angle to the hull's normal"),
                 Panel(plots.histogram({"tilt": tilt}, "angle, degrees", "texels, %"), "tilt"),
             ),
-            "Where the recovered normal leaves the hull's: hollows, relief, fabric. Speckle "
-            "means that the alignment is not determined there.",
+            "Angle between the recovered normal and the hull's: large in concavities, on "
+            "relief and fabric. Noise indicates that the alignment is undetermined there.",
             colour_bar=ColourBar("magma", 0, high, "degrees"),
             min_width=280,
         ),
     )
-    intro = "Orientations found from the reflectance alone, against those of the hull."
+    intro = "Local frames estimated from the reflectance alone, compared with the hull's."
     return Section("Normals and tangents", intro, items)
 
 
 def _atlas_panel(picture: NDArray[np.uint8], texel_of_pixel: ArrayLike, label: str) -> Panel:
-    """A picture of the atlas, transparent where there is no texel."""
+    """Image of the atlas, transparent where there is no texel."""
     shown = pictures.with_alpha(picture, np.asarray(texel_of_pixel) >= 0)
     return Panel(encode_picture(pictures.fitted(shown, ATLAS_PX), lossless=True), label)
 

@@ -1,4 +1,4 @@
-"""Section on what was left open: every field that was tried, and which was taken."""
+"""Section on model selection: every candidate run, and which was selected."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from reflfield.report.page import (
     format_bytes,
     format_seconds,
 )
-from reflfield.report.sections.alignment_gain import FieldVariant, middle_frame
+from reflfield.report.sections.alignment_gain import FieldVariant, median_photograph
 from reflfield.report.sections.held_out_images import METRIC_HEADER, metric_cells
 
-TITLE = "Choices"
+TITLE = "Model selection"
 
 
 @dataclass(frozen=True)
-class TriedField:
-    """One way to settle what was open.
+class CandidateRun:
+    """One of the fields to select from.
 
     Attributes
     ----------
     field : FieldVariant
-        Compared on the frames that decide.
+        Compared on the held-out photographs that decide.
     seconds : float
         Of all its stages, shared ones included.
     unseen : mapping of str to float, optional
-        Mean metrics of frames that had no part in the decision.
+        Mean metrics of photographs that had no part in the selection.
     """
 
     field: FieldVariant
@@ -43,7 +43,7 @@ class TriedField:
 
 
 def rules_section(words: Sequence[str]) -> Section:
-    """What was left open and settled without a trial.
+    """Options that were selected without a candidate run.
 
     Parameters
     ----------
@@ -60,27 +60,27 @@ def rules_section(words: Sequence[str]) -> Section:
     'No shadow could be traced.'
     """
     notes = tuple(Note(text) for text in words)
-    return Section(TITLE, "What the options left open was settled without a trial.", notes)
+    return Section(TITLE, "Options on auto that were selected without a candidate run.", notes)
 
 
-def choices_section(
-    tried: Sequence[TriedField],
-    taken: str,
+def candidate_runs_section(
+    runs: Sequence[CandidateRun],
+    selected: str,
     words: Sequence[str],
     pairs: Sequence[Iterable[FramePair]],
 ) -> Section:
-    """Fields of all trials on the frames that decided, and which was taken.
+    """All candidate runs on the photographs that decided, and which was selected.
 
     Parameters
     ----------
-    tried : sequence of TriedField
-        First the one that is taken in doubt.
-    taken : str
-        Name of the field that was taken.
+    runs : sequence of CandidateRun
+        First the one that is selected in doubt.
+    selected : str
+        Name of the field that was selected.
     words : sequence of str
-        A sentence for each option that was open.
+        A sentence for each option that was selected.
     pairs : sequence of iterable of FramePair
-        Of each field, the frames of its comparison in that order.
+        Of each field, the photographs of its comparison in that order.
 
     Returns
     -------
@@ -89,43 +89,44 @@ def choices_section(
     Raises
     ------
     InputError
-        If there are not two fields at least, or the one taken is not among them.
+        If there are not two fields at least, or the one selected is not among them.
     """
-    names = [one.field.name for one in tried]
-    if len(tried) < 2 or taken not in names:
+    names = [one.field.name for one in runs]
+    if len(runs) < 2 or selected not in names:
         raise InputError(
-            f"tried: expected two fields at least and {taken!r} among them, received {names}"
+            f"runs: expected two fields at least and {selected!r} among them, received {names}"
         )
     items: list[Item] = [Note(text) for text in words]
-    items.append(_compared(tried, names.index(taken)))
-    if all(one.unseen is not None for one in tried):
-        items.append(_unseen(tried, names.index(taken)))
-    # The field that was taken against the next best.
-    order = np.argsort([name != taken for name in names], kind="stable")
-    order[1:] = sorted(order[1:], key=lambda i: -_psnr(tried[i]))
+    items.append(_compared(runs, names.index(selected)))
+    if all(one.unseen is not None for one in runs):
+        items.append(_unseen(runs, names.index(selected)))
+    # The field that was selected against the next best.
+    order = np.argsort([name != selected for name in names], kind="stable")
+    order[1:] = sorted(order[1:], key=lambda i: -_psnr(runs[i]))
     items.append(
-        middle_frame(
-            [tried[i].field for i in order],
+        median_photograph(
+            [runs[i].field for i in order],
             [pairs[i] for i in order],
-            "Look at the edges of shadows and at highlights. The field taken is the first.",
+            "Look at the edges of shadows and at highlights. The selected field is the first.",
         )
     )
     intro = (
-        "What the options left open was settled by making every field. Down the table, a field "
-        "took the place of the one taken so far if its LDR PSNR, in the mean of the held-out "
-        "frames, was higher by more than chance: the standard error of the lead, and 1 dB over "
-        "the root of the number of frames. These frames have decided, and so speak a little "
-        "too well of the field taken."
+        "Options on auto were selected on held-out photographs, with a candidate run for each "
+        "combination. Down the table, a field replaced the one selected so far if its mean LDR "
+        "PSNR on the held-out photographs was significantly higher: by more than the standard "
+        "error of the difference, and by more than 1 dB over the square root of their number. "
+        "Since these photographs were used for the selection, their metrics are slightly "
+        "optimistic for the selected field."
     )
     return Section(TITLE, intro, tuple(items))
 
 
-def _psnr(one: TriedField) -> float:
+def _psnr(one: CandidateRun) -> float:
     return next(iter(one.field.comparisons.values())).mean["psnr_ldr"]
 
 
-def _compared(tried: Sequence[TriedField], taken: int) -> Table:
-    compared = [next(iter(one.field.comparisons.values())) for one in tried]
+def _compared(runs: Sequence[CandidateRun], selected: int) -> Table:
+    compared = [next(iter(one.field.comparisons.values())) for one in runs]
     psnr = np.array([[frame.psnr_ldr for frame in c.frames] for c in compared])
     wins = (psnr == psnr.max(axis=0)).sum(axis=1)
     rows = tuple(
@@ -139,23 +140,33 @@ def _compared(tried: Sequence[TriedField], taken: int) -> Table:
             format_bytes(one.field.file_bytes),
             format_seconds(one.seconds),
         )
-        for one, comparison, best in zip(tried, compared, wins, strict=True)
+        for one, comparison, best in zip(runs, compared, wins, strict=True)
     )
     return Table(
-        ("field", "PSNR LDR, dB", "SSIM", "FLIP", "best in", "error, %", "size", "time"),
+        (
+            "field",
+            "PSNR LDR, dB",
+            "SSIM",
+            "FLIP",
+            "best in",
+            "relative error, %",
+            "size",
+            "wall time",
+        ),
         rows,
-        "Mean over the held-out frames, which decided; the field taken stands out. Best in: "
-        "frames in which it has the highest PSNR. The error is on the samples that the field "
-        "was made of, shadowed ones only where shadows are kept. Time is of all its stages: "
-        "what several trials share was computed once.",
-        emphasised=(taken,),
+        "Mean over the held-out photographs used for the selection; the selected field is in "
+        "bold. Best in: photographs on which it has the highest PSNR. The relative error is on "
+        "the samples that the field was made of; shadowed ones count only where shadows are "
+        "kept. Wall time: of all its stages, including those that candidate runs "
+        "share.",
+        emphasised=(selected,),
     )
 
 
-def _unseen(tried: Sequence[TriedField], taken: int) -> Table:
+def _unseen(runs: Sequence[CandidateRun], selected: int) -> Table:
     return Table(
         ("field", *METRIC_HEADER),
-        tuple((one.field.name, *metric_cells(one.unseen or {})) for one in tried),
-        "Mean over unseen views and lights, which had no part in the decision.",
-        emphasised=(taken,),
+        tuple((one.field.name, *metric_cells(one.unseen or {})) for one in runs),
+        "Mean over unseen views and lights, which had no part in the selection.",
+        emphasised=(selected,),
     )

@@ -1,4 +1,4 @@
-"""Sections on pictures: held-out frames and what alignment brings to them."""
+"""Sections on images: held-out photographs beside rendered images; alignment scores."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from reflfield.report.page import (
 )
 
 ROW_PX = 480
-# FLIP errors of good results lie near 0; full scale would show black pictures.
+# FLIP errors of good results lie near 0; full scale would show black images.
 FLIP_SCALES = (0.1, 0.2, 0.3, 0.5, 1.0)
-# A distribution of fewer says less than their table.
+# Fewer are better read from the table.
 FRAMES_FOR_PLOTS = 6
-FLIP_LABEL = "FLIP error, all rows: 0 is not distinguishable"
+FLIP_LABEL = "FLIP error, all rows; 0: indistinguishable"
 METRIC_HEADER = ("PSNR LDR, dB", "PSNR HDR, dB", "SSIM", "FLIP")
 
 
@@ -45,21 +45,21 @@ def frames_section(
     comparison: Comparison,
     pairs: Iterable[FramePair],
     *,
-    title: str = "Held-out frames",
-    intro: str = "Photographs that the field has never seen, beside what it predicts for them.",
+    title: str = "Held-out photographs",
+    intro: str = "Photographs that the field was not made of, beside images rendered from it.",
     max_rows: int = 8,
 ) -> Section:
-    """Rows photograph | relit | error, and the table of metrics per frame.
+    """Rows photograph | image | error, and the table of metrics per photograph.
 
     Parameters
     ----------
     comparison : Comparison
-        Of the same frames.
+        Of the same photographs.
     pairs : iterable of FramePair
         In the order of the comparison; read once, one at a time.
     title, intro : str
     max_rows : int
-        Rows shown, from the worst frame to the best in even steps.
+        Rows shown, from the worst to the best in even steps.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def frames_section(
     Raises
     ------
     InputError
-        If the frames are not those of the comparison.
+        If the pairs are not those of the comparison.
     """
     shown = {id(f) for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
     rows = [
@@ -88,7 +88,7 @@ def frames_section(
 
 @dataclass(frozen=True, eq=False)
 class ComparedRow:
-    """One frame for the page: pictures, metrics, and FLIP errors, means over some pixels."""
+    """One row of the page: encoded images, metrics, and block means of FLIP errors."""
 
     metrics: FrameMetrics
     photograph: Picture
@@ -97,11 +97,11 @@ class ComparedRow:
 
 
 def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> ComparedRow:
-    """Crop a frame to the object and find where it differs."""
+    """Crop photograph and image to the object and compute their FLIP errors."""
     if pair.name != metrics.name:
         raise InputError(
-            f"pairs: expected frame {metrics.name!r} as in the comparison, received "
-            f"{pair.name!r}; pass the frames that were compared, in the same order"
+            f"pairs: expected {metrics.name!r} as in the comparison, received "
+            f"{pair.name!r}; pass the pairs that were compared, in the same order"
         )
     box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
     photograph, relit = (
@@ -120,7 +120,7 @@ def flip_scale(errors: Sequence[NDArray[np.floating]]) -> float:
 
 
 def error_panel(row: ComparedRow, high: float) -> Picture:
-    """Picture of a row's FLIP error, in false colours from 0 to `high`."""
+    """A row's FLIP error in false colours from 0 to `high`."""
     coloured = pictures.false_colour(row.error, 0, high, "magma")
     error = pictures.fitted(pictures.with_alpha(coloured, np.isfinite(row.error)), ROW_PX)
     return encode_picture(error, lossless=True)
@@ -131,12 +131,12 @@ def _row_figure(row: ComparedRow, high: float, *, has_bar: bool) -> Figure:
     return Figure(
         (
             Panel(row.photograph, "photograph"),
-            Panel(row.relit, "relit"),
+            Panel(row.relit, "image"),
             Panel(error_panel(row, high), f"FLIP error, 0 to {high:g}"),
         ),
         f"PSNR {m.psnr_ldr:.2f} dB (HDR {m.psnr_hdr:.2f} dB) · SSIM {m.ssim:.3f} · "
         f"FLIP {m.flip:.3f} · {m.n_pixels} object pixels"
-        + (f", {m.n_excluded} saturated ones left out" if m.n_excluded else ""),
+        + (f", {m.n_excluded} saturated ones excluded" if m.n_excluded else ""),
         title=m.name,
         colour_bar=ColourBar("magma", 0.0, high, FLIP_LABEL) if has_bar else None,
         min_width=0,
@@ -146,10 +146,10 @@ def _row_figure(row: ComparedRow, high: float, *, has_bar: bool) -> Figure:
 def _notes_on(comparison: Comparison) -> Note:
     ratio = " / ".join("–" if r is None else f"{r:.3f}" for r in comparison.colour_ratio)
     return Note(
-        f"All pictures at one exposure, {comparison.exposure:.4g}; nothing is rescaled per "
-        "picture. Rows go from the worst frame to the best. Look for missing or smeared "
-        "highlights, shadows with soft or displaced edges, and double contours. Brightness "
-        f"relit / photograph, mean over frames, R / G / B: {ratio} (1 is without bias). "
+        f"All photographs and images are shown at one exposure, {comparison.exposure:.4g}; "
+        "none is rescaled. Rows are sorted from the highest to the lowest FLIP error. Look "
+        "for missing or smeared highlights, soft or displaced edges of shadows, and double "
+        f"contours. Mean ratio image / photograph, R / G / B: {ratio} (1: no bias). "
         f"{measured_words(comparison)}"
     )
 
@@ -159,13 +159,13 @@ ORIGIN_WORDS = {
     "given": "given with the photographs",
     "alpha": "the alpha of the photographs of their cameras",
     "photographs": "made from all photographs of their cameras",
-    "hull": "the base surface as the cameras see it (too few photographs of those cameras)",
+    "hull": "the base surface as seen by the cameras (too few photographs of those cameras)",
     "image": "the whole image",
 }
 
 
 def measured_words(comparison: Comparison) -> str:
-    """On what the measures were taken, in a sentence or two."""
+    """Pixels and silhouettes that the metrics are computed on, in a sentence or two."""
     measured = comparison.measured
     words = "; ".join(
         f"{count} {ORIGIN_WORDS.get(origin, origin)}"
@@ -173,9 +173,9 @@ def measured_words(comparison: Comparison) -> str:
     )
     text = f"Measured on {measured['pixels']} pixels of the object. Silhouettes: {words}."
     if n := measured["saturated_pixels_left_out"]:
-        text += f" {n} pixels of the object are saturated in the photographs and left out."
+        text += f" {n} pixels of the object are saturated in the photographs and excluded."
     if names := measured["frames_not_measured"]:
-        text += f" Not measured, since they show no pixel of the object: {', '.join(names)}."
+        text += f" Not measured, because they show no pixel of the object: {', '.join(names)}."
     return text
 
 
@@ -188,18 +188,19 @@ def _distribution(comparison: Comparison) -> Figure:
     flips = {"FLIP": [f.flip for f in comparison.frames]}
     return Figure(
         (
-            Panel(plots.lines(curves, "frames, worst first", "PSNR, dB"), "PSNR, sorted"),
+            Panel(plots.lines(curves, "photographs, worst first", "PSNR, dB"), "PSNR, sorted"),
             Panel(
-                plots.histogram(flips, "FLIP", "frames, %", n_bins=20), "distribution of FLIP"
+                plots.histogram(flips, "FLIP", "photographs, %", n_bins=20),
+                "distribution of FLIP",
             ),
         ),
-        "A few frames far below the rest usually share a light or a view: see the table.",
+        "A few photographs far below the rest usually share a light or a view: see the table.",
         min_width=300,
     )
 
 
 def metrics_table(comparison: Comparison) -> Table:
-    """Metrics of every frame, and their mean on top.
+    """Metrics of every photograph, and their mean on top.
 
     Parameters
     ----------
@@ -216,10 +217,10 @@ def metrics_table(comparison: Comparison) -> Table:
         for f in worst_to_best(comparison.frames)
     ]
     return Table(
-        ("frame", *METRIC_HEADER, "object pixels"),
+        ("photograph", *METRIC_HEADER, "object pixels"),
         tuple(rows),
-        "Metrics per frame over object pixels, worst FLIP first. PSNR ends at "
-        f"{PSNR_CAP_DB:g} dB (equal pictures).",
+        "Metrics per photograph over object pixels, highest FLIP error first. PSNR is capped "
+        f"at {PSNR_CAP_DB:g} dB (identical images).",
         emphasised=(0,),
     )
 
@@ -239,14 +240,14 @@ def _even_choice(frames: Sequence[FrameMetrics], count: int) -> list[FrameMetric
 
 
 def alignment_section(history: ArrayLike, margin: ArrayLike) -> Section:
-    """Alignment: progress of the score, how determined it is.
+    """Alignment: score by iteration, and margin.
 
     Parameters
     ----------
     history : (n_iterations,) array_like
         Accumulated correlation after each iteration.
     margin : (n_texels,) array_like
-        Score gap to the next distinct peak; near 0 is not determined.
+        Score gap to the next distinct peak; near 0: undetermined.
 
     Returns
     -------
@@ -265,16 +266,18 @@ def alignment_section(history: ArrayLike, margin: ArrayLike) -> Section:
             ),
             Panel(plots.histogram({"margin": margin}, "margin", "texels, %"), "margin"),
         ),
-        "The score must never fall, and should level off. Texels at margin 0 have no "
-        "orientation of their own (matte or isotropic materials) and keep the hull's.",
+        "The score must never fall, and should converge. Texels with margin 0 are undetermined "
+        "(matte or isotropic materials) and keep the hull's frame.",
         min_width=300,
     )
-    intro = "One local frame per texel, found by correlating apparent BRDFs over all rotations."
+    intro = (
+        "One local frame per texel, estimated by correlating apparent BRDFs over all rotations."
+    )
     return Section("Alignment", intro, (figure,))
 
 
 def comparisons_table(comparisons: Mapping[str, Comparison]) -> Table:
-    """Mean metrics of sets of frames.
+    """Mean metrics of sets of photographs.
 
     Parameters
     ----------
@@ -285,7 +288,7 @@ def comparisons_table(comparisons: Mapping[str, Comparison]) -> Table:
     Table
     """
     return Table(
-        ("frames", *METRIC_HEADER),
+        ("photographs", *METRIC_HEADER),
         tuple((name, *metric_cells(c.mean)) for name, c in comparisons.items()),
-        "Mean over the frames: higher PSNR and SSIM and lower FLIP are better.",
+        "Mean over the photographs: higher PSNR and SSIM and lower FLIP are better.",
     )

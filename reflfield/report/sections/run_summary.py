@@ -34,7 +34,7 @@ def key_numbers(
     Parameters
     ----------
     comparison : Comparison, optional
-        Of the held-out frames.
+        Of the held-out photographs.
     file_bytes, raw_bytes : int, optional
         Size of the field file, and of its samples as half floats.
     seconds : float, optional
@@ -49,23 +49,28 @@ def key_numbers(
     >>> [(n.label, n.value) for n in key_numbers(file_bytes=10**6, raw_bytes=9 * 10**9)]
     [('field file', '1 MB'), ('compression', '9\u202f000 : 1')]
     """
-    found: list[KeyNumber] = []
+    numbers: list[KeyNumber] = []
     if comparison is not None:
-        mean, count = comparison.mean, f"mean of {len(comparison.frames)} held-out frames"
-        found += [
+        mean, count = (
+            comparison.mean,
+            f"mean of {len(comparison.frames)} held-out photographs",
+        )
+        numbers += [
             KeyNumber("PSNR (LDR)", f"{mean['psnr_ldr']:.2f} dB", count),
-            KeyNumber("SSIM", f"{mean['ssim']:.3f}", "1 is equal"),
-            KeyNumber("FLIP", f"{mean['flip']:.3f}", "0 is equal"),
+            KeyNumber("SSIM", f"{mean['ssim']:.3f}", "1: identical"),
+            KeyNumber("FLIP", f"{mean['flip']:.3f}", "0: indistinguishable"),
         ]
     if file_bytes is not None:
-        found.append(KeyNumber("field file", format_bytes(file_bytes), "everything to relight"))
+        numbers.append(
+            KeyNumber("field file", format_bytes(file_bytes), "all that relighting needs")
+        )
     if file_bytes and raw_bytes is not None:
         ratio = format_number(float(f"{raw_bytes / file_bytes:.3g}"))
         detail = f"of {format_bytes(raw_bytes)} of half-float samples"
-        found.append(KeyNumber("compression", f"{ratio} : 1", detail))
+        numbers.append(KeyNumber("compression", f"{ratio} : 1", detail))
     if seconds is not None:
-        found.append(KeyNumber("time", format_seconds(seconds), "all stages"))
-    return tuple(found)
+        numbers.append(KeyNumber("wall time", format_seconds(seconds), "all stages"))
+    return tuple(numbers)
 
 
 def compression_section(parts: Mapping[str, int], raw_bytes: int) -> Section:
@@ -96,7 +101,7 @@ def compression_section(parts: Mapping[str, int], raw_bytes: int) -> Section:
             ("field file", format_bytes(total), "100 %"),
             ("samples as half floats", format_bytes(raw_bytes), ""),
         ),
-        "Where the bytes of the field file go.",
+        "Size of each part of the field file.",
         emphasised=(len(rows),),
     )
     intro = f"The field file holds {format_bytes(total)}.{ratio}"
@@ -105,7 +110,7 @@ def compression_section(parts: Mapping[str, int], raw_bytes: int) -> Section:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What one stage took and gave.
+    """Resources, inputs and outputs of one stage.
 
     Attributes
     ----------
@@ -115,7 +120,7 @@ class StageRecord:
     peak_bytes : int, optional
         Peak resident memory.
     inputs, outputs : mapping of name to count
-        Such as ``{"photographs": 1024}``; nothing is dropped without being
+        Such as ``{"photographs": 1024}``; every item left out is
         counted.
     size_bytes : int, optional
         Of its results on disk.
@@ -158,16 +163,16 @@ def stages_section(stages: Sequence[StageRecord]) -> Section:
         for stage in stages
     )
     table = Table(
-        ("stage", "time", "peak memory", "in", "out", "on disk"),
+        ("stage", "wall time", "peak memory", "in", "out", "on disk"),
         (*rows, ("total", format_seconds(total), None, None, None, None)),
-        "Counts out should be explained by counts in: nothing is dropped silently. Reused "
-        "stages quote the time of the run that made them.",
+        "Counts in and out of each stage. Reused stages show the wall time of the run that "
+        "computed them.",
         emphasised=(len(rows),),
     )
     plot = plots.bars([s.name for s in stages], [s.seconds for s in stages], "seconds")
-    figure = Figure((Panel(plot),), "Where the time goes.", min_width=300)
+    figure = Figure((Panel(plot),), "Wall time of each stage.", min_width=300)
     return Section(
-        "Stages", f"All stages together took {format_seconds(total)}.", (figure, table)
+        "Stages", f"Wall time of all stages: {format_seconds(total)}.", (figure, table)
     )
 
 

@@ -1,4 +1,4 @@
-"""Section that accounts for every photograph, sample and texel."""
+"""Section on sample bookkeeping: what became of every photograph, sample and texel."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from reflfield.report.page import Cell, Item, Note, Section, Table
 
 
 @dataclass(frozen=True)
-class Account:
+class CountedItems:
     """What went into a stage, and what became of it.
 
     Attributes
@@ -29,22 +29,22 @@ class Account:
 
     @property
     def missing(self) -> int:
-        """Things that no part accounts for; negative where some are counted twice.
+        """Items that no part holds; negative where some are counted twice.
 
         Examples
         --------
-        >>> Account("capture", "photographs", 9, {"used": 6, "held out": 2}).missing
+        >>> CountedItems("capture", "photographs", 9, {"used": 6, "held out": 2}).missing
         1
         """
         return self.total - sum(self.parts.values())
 
 
-def accounts_section(accounts: Sequence[Account]) -> Section:
-    """Table of all accounts, with a warning for each that does not add up.
+def bookkeeping_section(entries: Sequence[CountedItems]) -> Section:
+    """Table of all counts, with a warning for each that does not add up.
 
     Parameters
     ----------
-    accounts : sequence of Account
+    entries : sequence of CountedItems
         In the order of the stages.
 
     Returns
@@ -52,24 +52,24 @@ def accounts_section(accounts: Sequence[Account]) -> Section:
     Section
     """
     rows: list[tuple[Cell, ...]] = []
-    for account in accounts:
-        rows.append((account.stage, account.things, "in", account.total))
-        rows += [("", "", name, count) for name, count in account.parts.items() if count]
-        if account.missing:
-            rows.append(("", "", "not accounted for", account.missing))
+    for entry in entries:
+        rows.append((entry.stage, entry.things, "in", entry.total))
+        rows += [("", "", name, count) for name, count in entry.parts.items() if count]
+        if entry.missing:
+            rows.append(("", "", "unaccounted", entry.missing))
     items: list[Item] = [
         Note(
-            f"{account.stage}: {account.missing} of {account.total} {account.things} are not "
-            "accounted for.",
+            f"{entry.stage}: {entry.missing} of {entry.total} {entry.things} are "
+            "unaccounted for.",
             is_warning=True,
         )
-        for account in accounts
-        if account.missing
+        for entry in entries
+        if entry.missing
     ]
     table = Table(
-        ("stage", "what", "what became of it", "count"),
+        ("stage", "items", "outcome", "count"),
         tuple(rows),
-        "Each count in is the sum of the counts below it.",
+        "Each count marked in is the sum of the counts below it.",
     )
-    intro = "Nothing is dropped silently: every count in is accounted for."
-    return Section("Accounts", intro, (*items, table))
+    intro = "What became of every photograph, sample and texel."
+    return Section("Sample bookkeeping", intro, (*items, table))

@@ -30,7 +30,7 @@ class RatePoint:
     samples_db : float
         LDR PSNR on the samples that the field was made of.
     heldout_db : float or None
-        Mean LDR PSNR of the frames that it has not seen; None without such frames.
+        Mean LDR PSNR of the held-out photographs; None without any.
     """
 
     curve: str
@@ -47,7 +47,7 @@ def rate_distortion_section(points: Sequence[RatePoint], note: str = "") -> Sect
     points : sequence of RatePoint
         At least one.
     note : str
-        What else is to be said of the curves.
+        A remark on the curves.
 
     Returns
     -------
@@ -62,11 +62,11 @@ def rate_distortion_section(points: Sequence[RatePoint], note: str = "") -> Sect
         raise InputError("points: expected at least one, received none")
     panels = [Panel(_plot(points, "samples_db", "LDR PSNR of the samples, dB"), "samples")]
     if any(point.heldout_db is not None for point in points):
-        plot = _plot(points, "heldout_db", "LDR PSNR of held-out frames, dB")
-        panels.insert(0, Panel(plot, "held-out frames"))
+        plot = _plot(points, "heldout_db", "LDR PSNR of held-out photographs, dB")
+        panels.insert(0, Panel(plot, "held-out photographs"))
     figure = Figure(
         tuple(panels),
-        "Each curve is one model, quantised more and more coarsely from right to left.",
+        "Each curve is one model; the relative quantisation step grows from right to left.",
         min_width=0,
     )
     return Section(

@@ -32,16 +32,16 @@ def truth_section(
     completion: CompletionError | None = None,
     comparison: Comparison | None = None,
 ) -> Section:
-    """Scores against the truth of a simulated capture; what is not given is left out.
+    """Scores against the truth of a simulated capture; those without a value are left out.
 
     Parameters
     ----------
     hull : HullDistance, optional
     frames, base_frames : FrameErrors, optional
-        Of the recovered frames, and of the hull's for comparison.
+        Of the recovered local frames, and of the hull's for comparison.
     completion : CompletionError, optional
     comparison : Comparison, optional
-        Relit against true pictures.
+        Rendered images against the true ones.
 
     Returns
     -------
@@ -51,12 +51,12 @@ def truth_section(
     if hull is not None:
         items += _hull_items(hull)
     if frames is not None:
-        items += _frame_items({"recovered": frames} | _if_given("hull", base_frames))
+        items += _frame_items({"recovered": frames} | _optional("hull", base_frames))
     if completion is not None:
         items.append(_completion_table(completion))
     if comparison is not None:
-        items.append(comparisons_table({"relit against truth": comparison}))
-    intro = "The capture was simulated, so the right answers are known."
+        items.append(comparisons_table({"images against the truth": comparison}))
+    intro = "The capture was simulated, so the true values are known."
     return Section("Against the truth", intro, tuple(items))
 
 
@@ -72,24 +72,25 @@ def _hull_items(hull: HullDistance) -> list[Item]:
     figure = Figure(
         (Panel(plot),),
         "A visual hull encloses the object, so most of its area should lie outside (right of "
-        "0), far outside where hollows cannot be seen in any silhouette. Area left of 0 was "
-        "carved away wrongly or smoothed off.",
+        "0), far outside at concavities that no silhouette shows. Area left of 0 was carved "
+        "away wrongly or removed by smoothing.",
         title="Hull against the true surface",
         min_width=300,
     )
     return [figure, _hull_table(hull.summary())]
 
 
-def _hull_table(found: Mapping[str, float]) -> Table:
+def _hull_table(summary: Mapping[str, float]) -> Table:
     statistics = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "largest"}
     return Table(
         ("distance", "mm", "voxels"),
         tuple(
-            (label, found[f"{key}_mm"], found.get(f"{key}_voxels"))
+            (label, summary[f"{key}_mm"], summary.get(f"{key}_voxels"))
             for key, label in statistics.items()
         ),
-        f"Unsigned distance of the hull from the true surface. {found['outside_share']:.1%} of "
-        f"the hull's area lies outside of the object, {found['inside_share']:.1%} inside.",
+        "Unsigned distance of the hull from the true surface. "
+        f"{summary['outside_share']:.1%} of the hull's area lies outside of the object, "
+        f"{summary['inside_share']:.1%} inside.",
     )
 
 
@@ -108,13 +109,13 @@ def _frame_items(variants: Mapping[str, FrameErrors]) -> list[Item]:
     figure = Figure(
         panels,
         "Recovered frames should be closer to the truth than the hull's. Tangents are compared "
-        "as lines (half a turn changes nothing), after one turn about the normal was taken out "
-        "for each target and material, which the reflectance leaves open. Guessed tangents "
-        "are uniform from 0 to 90 degrees: so they are on isotropic materials.",
+        "as lines (modulo 180 degrees), after removing one rotation about the normal for each "
+        "target and material, which the reflectance does not determine. Random tangents are "
+        "uniform from 0 to 90 degrees, as on isotropic materials.",
         title="Frames against the true shading frames",
         min_width=300,
     )
-    return [figure, _frame_table(variants), _turns_table(variants)]
+    return [figure, _frame_table(variants), _rotations_table(variants)]
 
 
 def _frame_table(variants: Mapping[str, FrameErrors]) -> Table:
@@ -141,28 +142,28 @@ def _frame_table(variants: Mapping[str, FrameErrors]) -> Table:
             for group, members in groups.items()
             for name, errors in members.items()
         ),
-        "Frame errors over the texels that have a true surface point near them. The tangents "
-        "of isotropic materials stand at 45 degrees, a guess.",
+        "Frame errors over the texels that have a true surface point near them. The "
+        "tangents of isotropic materials are undetermined: 45 degrees on average.",
     )
 
 
 def _frame_row(
-    kind: str, group: str, name: str, found: Mapping[str, float]
+    kind: str, group: str, name: str, summary: Mapping[str, float]
 ) -> tuple[Cell, ...]:
-    angles = (found[f"{kind}_{statistic}_deg"] for statistic in ("mean", "median", "p95"))
-    return kind, group, name, *angles, int(found["n_texels"])
+    angles = (summary[f"{kind}_{statistic}_deg"] for statistic in ("mean", "median", "p95"))
+    return kind, group, name, *angles, int(summary["n_texels"])
 
 
-def _turns_table(variants: Mapping[str, FrameErrors]) -> Table:
+def _rotations_table(variants: Mapping[str, FrameErrors]) -> Table:
     return Table(
-        ("frames", "target", "material", "turn removed, °", "texels"),
+        ("frames", "target", "material", "rotation removed, °", "texels"),
         tuple(
             (name, turn.target, turn.label, f"{turn.degrees:.1f}", turn.n_texels)
             for name, errors in variants.items()
             for turn in errors.turns
         ),
-        "Turns about the normal taken out before tangents are compared: a target and all its "
-        "frames may be turned together without a change to what they explain.",
+        "Rotations about the normal removed before tangents are compared: rotating a target "
+        "and all its frames together does not change the fit.",
     )
 
 
@@ -170,13 +171,14 @@ def _completion_table(error: CompletionError) -> Table:
     return Table(
         ("entries", "count", "relative error", "relative error, cube root"),
         (
-            ("filled in", error.n_unobserved, error.unobserved, error.unobserved_cube_root),
+            ("completed", error.n_unobserved, error.unobserved, error.unobserved_cube_root),
             ("measured", error.n_observed, error.observed, error.observed_cube_root),
         ),
-        "Completion against the true apparent BRDFs. Filled-in entries should be nearly as "
-        "close as measured ones; the cube root weighs dark samples more.",
+        "Relative error of the completion against the true apparent BRDFs. Completed entries "
+        "should be nearly as accurate as measured ones; the cube root weighs dark samples "
+        "more.",
     )
 
 
-def _if_given(name: str, errors: FrameErrors | None) -> dict[str, FrameErrors]:
+def _optional(name: str, errors: FrameErrors | None) -> dict[str, FrameErrors]:
     return {} if errors is None else {name: errors}
