@@ -10,12 +10,12 @@ from reflfield.field.evaluation import (
     sum_lights,
     texel_taps,
 )
-from reflfield.field.synthetic import baked_field, blinn_phong, lambert, square_surface
 from reflfield.sphere.hemisphere import (
     HORIZON_SOFTNESS,
     HemisphereGrid,
     softened_cosine,
 )
+from tests.synthetic_fields import baked_field, blinn_phong, lambert, square_surface
 
 POWER = {"cube_root": 3, "square_root": 2, "linear": 1}
 

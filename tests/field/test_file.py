@@ -15,7 +15,7 @@ from reflfield.field.build import Quantisation
 from reflfield.field.evaluation import evaluate
 from reflfield.field.file import FORMAT_VERSION, describe, open_field, write_field
 from reflfield.field.reflectance_field import ARRAYS
-from reflfield.field.synthetic import baked_field, lambert, square_surface
+from tests.synthetic_fields import baked_field, lambert, square_surface
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import pytest
 from reflfield.capture.encoding import encode_srgb
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
-from reflfield.field.synthetic import baked_field, blinn_phong, square_surface
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.frame_resampling import ResamplingOptions
 from reflfield.observations.image_projection import directions_of, pairs_photographed
@@ -17,6 +16,7 @@ from reflfield.observations.store import (
     open_samples,
 )
 from reflfield.observations.texel_reading import TexelReader
+from tests.synthetic_fields import baked_field, blinn_phong, square_surface
 
 from .rigs import dome
 

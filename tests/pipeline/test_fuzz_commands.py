@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from reflfield.field.file import write_field
-from reflfield.field.synthetic import baked_field, lambert, square_surface
 from reflfield.pipeline.pipeline_options import PipelineOptions
+from tests.synthetic_fields import baked_field, lambert, square_surface
 
 SEED = 13
 MOST_SECONDS = 10

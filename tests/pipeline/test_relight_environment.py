@@ -6,7 +6,7 @@ from PIL import Image
 
 from reflfield.capture.image_writing import write_exr
 from reflfield.field.file import write_field
-from reflfield.field.synthetic import baked_field, lambert, sphere_surface
+from tests.synthetic_fields import baked_field, lambert, sphere_surface
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import pytest
 
 from reflfield.capture.image_writing import write_exr
 from reflfield.field.file import write_field
-from reflfield.field.synthetic import baked_field, lambert, sphere_surface
 from reflfield.options import Resources
 from reflfield.pipeline.memory import check_picture_memory
 from reflfield.render.renderer import RenderOptions
+from tests.synthetic_fields import baked_field, lambert, sphere_surface
 
 GB = 1 << 30
 

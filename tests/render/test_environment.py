@@ -12,18 +12,18 @@ from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import Light
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError, InputError, ShapeError
-from reflfield.field.synthetic import (
+from reflfield.geometry.mesh import read_ply
+from reflfield.render.environment_map import EnvironmentMap, direction_from_uv
+from reflfield.render.renderer import Renderer, RenderOptions, render
+from reflfield.render.turntable import OrbitOptions, orbit_cameras
+from reflfield.sphere.rotations import frames_from_normals
+from tests.synthetic_fields import (
     FramedSurface,
     baked_field,
     lambert,
     sphere_surface,
     square_surface,
 )
-from reflfield.geometry.mesh import read_ply
-from reflfield.render.environment_map import EnvironmentMap, direction_from_uv
-from reflfield.render.renderer import Renderer, RenderOptions, render
-from reflfield.render.turntable import OrbitOptions, orbit_cameras
-from reflfield.sphere.rotations import frames_from_normals
 
 # Image coordinates (u, v down) and the axis they show, by the formulas of the formats.
 AXES = {

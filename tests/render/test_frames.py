@@ -10,12 +10,12 @@ from reflfield.capture.capture import Capture, Exposure, Photograph
 from reflfield.capture.image_files import read_coverage, read_image
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
-from reflfield.field.synthetic import baked_field, lambert, sphere_surface
 from reflfield.render.exposure import ExposureMeter
 from reflfield.render.relit_photographs import relight_frames
 from reflfield.render.renderer import RenderOptions, render
 from reflfield.render.turntable import OrbitOptions, orbit_cameras, render_orbit
 from reflfield.util.progress import listening
+from tests.synthetic_fields import baked_field, lambert, sphere_surface
 
 FAST = RenderOptions(workers=1, samples_per_pixel=4)
 

@@ -11,7 +11,10 @@ from reflfield.errors import InputError
 from reflfield.field.build import FittedReflectance, build_field
 from reflfield.field.evaluation import evaluate, texel_taps
 from reflfield.field.indirect_light import IndirectLight
-from reflfield.field.synthetic import (
+from reflfield.geometry.ray_scene import RayScene
+from reflfield.render.camera_rays import pixel_window
+from reflfield.render.renderer import Renderer, RenderOptions, render
+from tests.synthetic_fields import (
     FramedSurface,
     baked_field,
     blinn_phong,
@@ -19,9 +22,6 @@ from reflfield.field.synthetic import (
     sphere_surface,
     square_surface,
 )
-from reflfield.geometry.ray_scene import RayScene
-from reflfield.render.camera_rays import pixel_window
-from reflfield.render.renderer import Renderer, RenderOptions, render
 
 ONE_THREAD = RenderOptions(workers=1)
 

@@ -1,7 +1,6 @@
 """Fields with known answers: analytic reflectance on a square or a sphere.
 
-Tests and benchmarks of later rooms start from these, so that a rendered pixel
-can be held against a formula.
+Tests start from these, so that a rendered pixel can be compared with a formula.
 """
 
 from __future__ import annotations
