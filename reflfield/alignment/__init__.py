@@ -1,18 +1,17 @@
-"""Local frames from reflectance: correlation over SO(3), clusters, refinement, normal maps."""
+"""Local frames from reflectance: correlation over SO(3), EM, materials, refinement."""
 
-from reflfield.alignment.aligning import Alignment, align
-from reflfield.alignment.alignment_samples import SampleSource
-from reflfield.alignment.normal_maps import local_map, world_map
+from reflfield.alignment.align_texels import Alignment, align
 from reflfield.alignment.refinement import RefinementOptions
 from reflfield.alignment.rotation_search import SearchResult, search
+from reflfield.alignment.sample_sources import SampleSet, SampleSource, ScatteredSource
 
 __all__ = [
     "Alignment",
     "RefinementOptions",
+    "SampleSet",
     "SampleSource",
+    "ScatteredSource",
     "SearchResult",
     "align",
-    "local_map",
     "search",
-    "world_map",
 ]

@@ -15,13 +15,74 @@ and the angular momenta J couple orders at most two apart.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
 from reflfield.sphere.coupling import Coupled
-from reflfield.sphere.wigner import Turn, block_offsets, euler_turns, fill_wigner_d
+from reflfield.sphere.wigner import (
+    Turn,
+    block_offsets,
+    degree_tables,
+    euler_turns,
+    fill_wigner_d,
+)
+
+
+class DegreeArrays(NamedTuple):
+    """Tables of the Wigner-d recursion as the kernels take them; see `DegreeTables`."""
+
+    row_start: NDArray[np.int64]
+    recursion: NDArray[np.floating]
+    edge: NDArray[np.floating]
+    ladder: NDArray[np.floating]
+
+
+class ComplexSeries(NamedTuple):
+    """Rows m >= 0 of one complex series, tables of its degrees, and scratch.
+
+    Parameters
+    ----------
+    re, im : (n_entries,) float
+        See `complex_spectrum`.
+    tables : DegreeArrays
+    d : (n_entries,) float
+        Wigner-d elements; zero at first.
+    phases : (2, size of `edge`) float
+    """
+
+    re: NDArray[np.floating]
+    im: NDArray[np.floating]
+    tables: DegreeArrays
+    d: NDArray[np.floating]
+    phases: NDArray[np.floating]
+
+
+def degree_arrays(n_degrees: int, dtype: str) -> DegreeArrays:
+    """Tables of the recursion for degrees below `n_degrees`."""
+    tables = degree_tables(n_degrees, dtype)
+    return DegreeArrays(tables.row_start, tables.recursion, tables.edge, tables.ladder)
+
+
+def degrees_of(series: NDArray[np.floating]) -> int:
+    """Total degrees of a real series, from its length."""
+    return int(np.searchsorted(block_offsets(64), series.shape[1]))
+
+
+@numba.njit(cache=True, nogil=True)
+def empty_series(tables: DegreeArrays, like: NDArray[np.floating]) -> ComplexSeries:
+    """Room for a series of the degrees of the tables, in the type of `like`."""
+    n_entries, kind = tables.recursion.shape[1], like.dtype
+    return ComplexSeries(
+        np.zeros(n_entries, kind),
+        np.zeros(n_entries, kind),
+        tables,
+        np.zeros(n_entries, kind),
+        np.zeros((2, tables.edge.size), kind),
+    )
 
 
 def spectrum(
@@ -65,16 +126,12 @@ def spectrum(
 
 
 @numba.njit(cache=True, nogil=True)
-def complex_spectrum(
-    series: NDArray[np.floating],
-    row_start: NDArray[np.int64],
-    re: NDArray[np.floating],
-    im: NDArray[np.floating],
-) -> None:
+def complex_spectrum(series: NDArray[np.floating], out: ComplexSeries) -> None:
     """Rows m >= 0 of the complex series of a real one, those of m > 0 doubled.
 
-    As many degrees as `row_start` (see `DegreeTables`) has; the series may have more.
+    As many degrees as the tables of `out` have; the real series may have more.
     """
+    row_start, re, im = out.tables.row_start, out.re, out.im
     offset, width = 0, row_start[1] - row_start[0]
     zero, one = series.dtype.type(0.0), series.dtype.type(1.0)
     root = series.dtype.type(np.sqrt(0.5))
@@ -195,30 +252,20 @@ def _add_degree(
 
 @numba.njit(cache=True, nogil=True)
 def derivatives(
-    rotation: NDArray[np.float64],
-    re: NDArray[np.floating],
-    im: NDArray[np.floating],
-    row_start: NDArray[np.int64],
-    recursion: NDArray[np.floating],
-    edge: NDArray[np.floating],
-    ladder: NDArray[np.floating],
-    d: NDArray[np.floating],
-    phases: NDArray[np.floating],
-    out: NDArray[np.float64],
+    rotation: NDArray[np.float64], series: ComplexSeries, out: NDArray[np.float64]
 ) -> None:
-    """Value, gradient (x, y, z) and Hessian (xx, yy, zz, xy, xz, yz) of C(R exp w).
-
-    `re` and `im` are from `complex_spectrum`, `d` (zero at first) and `phases` are scratch.
-    """
+    """Value, gradient (x, y, z) and Hessian (xx, yy, zz, xy, xz, yz) of C(R exp w)."""
+    re, im, d, phases = series.re, series.im, series.d, series.phases
+    row_start, edge, ladder = series.tables.row_start, series.tables.edge, series.tables.ladder
     alpha, beta, gamma = euler_turns(rotation)
-    fill_wigner_d(beta, row_start, recursion, edge, d)
+    fill_wigner_d(beta, row_start, series.tables.recursion, edge, d)
     _fill_plane(alpha, gamma, edge.shape[1], phases)
     for i in range(10):
         out[i] = 0.0
     for j in range(row_start.shape[0] - 1):
         first, last = row_start[j], row_start[j + 1]
         _add_degree(re, im, phases, d, ladder, first, last, j * (j + 1.0), out)
-    # From axes turned by gamma, in which the sums are taken, to the body's own.
+    # From axes rotated by gamma, in which the sums are taken, to the body's own.
     c, s = gamma
     x, y, xx, yy, xy, xz, yz = out[1], out[2], out[4], out[5], out[7], out[8], out[9]
     out[1], out[2] = c * x + s * y, c * y - s * x

@@ -33,9 +33,9 @@ SEEDING_SAMPLE = 256
 SEEDING_TRIALS = 6
 # A function this many times brighter than the median weighs no more in the mean.
 WEIGHT_LIMIT = 4.0
-# The accumulated correlation has converged when it grows by less than this share.
 # Newton steps from the rotation of the iteration before.
-CLIMBING_STEPS = 8
+ASCENT_STEPS = 8
+# The accumulated correlation has converged when it grows by less than this share.
 CONVERGED_GAIN = 1e-6
 MEAN_BLOCK = 256
 
@@ -48,15 +48,15 @@ class TargetFit:
     ----------
     targets : Coupled
         One unit function a cluster.
-    found : SearchResult
+    matches : SearchResult
         Rotation, score, margin and cluster of each function.
     history : (k,) float64
         Weighted mean of the correlations with unit targets, over the largest possible: 1 if all
-        functions are turned copies. Never falls.
+        functions are rotated copies. Never falls.
     """
 
     targets: Coupled
-    found: SearchResult
+    matches: SearchResult
     history: NDArray[np.float64]
 
 
@@ -96,19 +96,19 @@ def fit_targets(
     options: SearchOptions = {"max_tilt": max_tilt, "n_threads": n_threads}
     targets = seed_targets(units, weights, n_clusters, rng, options)
     history: list[float] = []
-    found: SearchResult | None = None
+    matches: SearchResult | None = None
     for iteration in range(iterations):
         report("aligning", iteration, iterations)
-        found = _expectation(units, targets, found, options)
-        history.append(float(weights @ found.score / max(weights.sum(), 1e-300)))
+        matches = _expectation(units, targets, matches, options)
+        history.append(float(weights @ matches.score / max(weights.sum(), 1e-300)))
         if len(history) > 1 and history[-1] - history[-2] <= CONVERGED_GAIN * abs(history[-1]):
             break
-        targets = mean_targets(units, weights, found, len(targets))
-        targets = _reseed_empty(targets, units, weights, found)
+        targets = mean_targets(units, weights, matches, len(targets))
+        targets = _reseed_empty(targets, units, weights, matches)
     report("aligning", iterations, iterations)
-    if found is None:
-        found = search(units, targets, **options)
-    return TargetFit(targets, found, np.array(history))
+    if matches is None:
+        matches = search(units, targets, **options)
+    return TargetFit(targets, matches, np.array(history))
 
 
 def mean_weights(norms: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -116,8 +116,8 @@ def mean_weights(norms: NDArray[np.float64]) -> NDArray[np.float64]:
     positive = norms[norms > 0]
     if len(positive) == 0:
         return np.zeros_like(norms)
-    middle = float(np.median(positive))
-    return np.minimum(norms / middle, WEIGHT_LIMIT)
+    median = float(np.median(positive))
+    return np.minimum(norms / median, WEIGHT_LIMIT)
 
 
 def _expectation(
@@ -125,9 +125,11 @@ def _expectation(
 ) -> SearchResult:
     """Best rotation and target; from the earlier rotation first, where one is known."""
     if before is None or len(targets) > 1:
-        found = search(units, targets, margins=False, **options)
-        return found if before is None else _not_worse(units, targets, found, before, options)
-    near = climb_near(units, targets, before, CLIMBING_STEPS, options)
+        matches = search(units, targets, margins=False, **options)
+        return (
+            matches if before is None else _not_worse(units, targets, matches, before, options)
+        )
+    near = ascend_near(units, targets, before, ASCENT_STEPS, options)
     fell = np.flatnonzero(near.score < before.score)
     if len(fell) > 0:
         start = near.rotations[fell]
@@ -137,14 +139,14 @@ def _expectation(
     return near
 
 
-def climb_near(
+def ascend_near(
     units: Coupled,
     targets: Coupled,
     before: SearchResult,
     n_steps: int,
     options: SearchOptions,
 ) -> SearchResult:
-    """Climb from known rotations on the series of each function's own target.
+    """Newton ascent from known rotations, each function towards its own target.
 
     Parameters
     ----------
@@ -184,59 +186,59 @@ def climb_near(
 def _not_worse(
     units: Coupled,
     targets: Coupled,
-    found: SearchResult,
+    matches: SearchResult,
     before: SearchResult,
     options: SearchOptions,
 ) -> SearchResult:
     """Keep the earlier cluster and rotation where the search found nothing better."""
-    near = climb_near(units, targets, before, CLIMBING_STEPS, options)
-    better = near.score > found.score
+    near = ascend_near(units, targets, before, ASCENT_STEPS, options)
+    better = near.score > matches.score
     for name in ("rotations", "score", "cluster"):
-        getattr(found, name)[better] = getattr(near, name)[better]
-    return found
+        getattr(matches, name)[better] = getattr(near, name)[better]
+    return matches
 
 
 def mean_targets(
-    units: Coupled, weights: NDArray[np.float64], found: SearchResult, n_targets: int
+    units: Coupled, weights: NDArray[np.float64], matches: SearchResult, n_targets: int
 ) -> Coupled:
-    """Unit mean of each cluster's functions, turned back into the common frame.
+    """Unit mean of each cluster's functions, rotated back into the common frame.
 
     Returns
     -------
     Coupled
         `n_targets` functions; zero where a cluster is empty.
     """
-    totals = [_turned_sum(units, weights, found, k) for k in range(n_targets)]
+    totals = [_rotated_sum(units, weights, matches, k) for k in range(n_targets)]
     return join_coupled(totals).units()
 
 
-def _turned_sum(
-    units: Coupled, weights: NDArray[np.float64], found: SearchResult, k: int
+def _rotated_sum(
+    units: Coupled, weights: NDArray[np.float64], matches: SearchResult, k: int
 ) -> Coupled:
     """Sum of w_i Delta(R_i)^T A_i over a cluster, one product per degree and block."""
     offsets = block_offsets(units.n_degrees)
     totals = [np.zeros(block.shape[1:], np.float64) for block in units.blocks]
-    members = np.flatnonzero((found.cluster == k) & (weights > 0))
+    members = np.flatnonzero((matches.cluster == k) & (weights > 0))
     for first in range(0, len(members), MEAN_BLOCK):
         rows = members[first : first + MEAN_BLOCK]
-        turns = rotation_blocks(found.rotations[rows], units.n_degrees, str(units.dtype))
-        turns *= weights[rows, None].astype(turns.dtype)
+        matrices = rotation_blocks(matches.rotations[rows], units.n_degrees, str(units.dtype))
+        matrices *= weights[rows, None].astype(matrices.dtype)
         for j, block in enumerate(units.blocks):
             size = 2 * j + 1
-            delta = turns[:, offsets[j] : offsets[j + 1]].reshape(-1, size)
+            delta = matrices[:, offsets[j] : offsets[j + 1]].reshape(-1, size)
             totals[j] += delta.T @ block[rows].reshape(-1, block.shape[2])
     blocks = tuple(total[None].astype(units.dtype) for total in totals)
     return Coupled(units.band_limits, blocks)
 
 
 def _reseed_empty(
-    targets: Coupled, units: Coupled, weights: NDArray[np.float64], found: SearchResult
+    targets: Coupled, units: Coupled, weights: NDArray[np.float64], matches: SearchResult
 ) -> Coupled:
     """Give each empty cluster the function that fits its own cluster worst."""
     empty = np.flatnonzero(~(targets.norms() > 0))
     if len(empty) == 0:
         return targets
-    loss = weights * (1.0 - found.score)
+    loss = weights * (1.0 - matches.score)
     worst = np.argsort(-loss, kind="stable")[: len(empty)]
     parts = [targets[k : k + 1] for k in range(len(targets))]
     for k, i in zip(empty, worst, strict=False):

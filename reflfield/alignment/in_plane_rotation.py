@@ -1,147 +1,165 @@
-"""The turn about the normal, where band-limited correlation leaves it open.
+"""The rotation about the normal, where band-limited correlation leaves it undetermined.
 
-A reflectance that is nearly round about its normal correlates best where the dome's horizon
-cuts target and texel on the same side: the turn then follows the tilt and not the
-material. On the samples both horizons are known. All turns are tried against the sharp target,
+A reflectance that is nearly isotropic about its normal correlates best where the dome's horizon
+cuts target and texel on the same side: the in-plane angle then follows the tilt and not the
+material. On the samples both horizons are known. All angles are tried against the sharp target,
 which begins with the texel that is tilted least and so breaks the symmetry; it is
-then fitted to all texels again, in turn with their turns.
+then fitted to all texels again, alternating with their angles.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.frame_ambiguity import Symmetry, fold
-from reflfield.alignment.materials import (
-    FORGIVEN,
-    Materials,
-    one_round,
-    own_misfit,
-    thinned,
+from reflfield.alignment.frame_ambiguity import Symmetry, reduce_to_fundamental_zone
+from reflfield.alignment.material_clusters import ENOUGH_SAMPLES, choose, one_round
+from reflfield.alignment.material_distance import log_improvement, own_distance
+from reflfield.alignment.refinement import (
+    RefinementOptions,
+    SharpAlignment,
+    fit_sharp_targets,
 )
-from reflfield.alignment.refinement import RefinementOptions, SampleSet, fit_nodes
 from reflfield.alignment.rotation_search import rotation_about
+from reflfield.alignment.sample_sources import SampleSet
 from reflfield.sphere.rotations import Array
 
-# Turns tried, 15 degrees apart: what counts as another peak in the margin.
-N_TURNS = 24
-# Rounds on the round target, and of turns and target.
-ROUND_ROUNDS = 4
-TURN_ROUNDS = 4
-# Turns are known if the best ones are closer than others by this much in the log of the
-# distance. Round ones reach a third where the axis is known roughly, weak ones three.
+# Angles tried, 15 degrees apart: what counts as another maximum in the margin.
+N_ANGLES = 24
+# Rounds on the isotropic target, and of angles and target.
+ISOTROPIC_ROUNDS = 4
+ANGLE_ROUNDS = 4
+# Angles and normals of a texel are improved in alternation so often.
+ANGLE_PASSES = 3
+# Angles are known if the best ones are closer than the median one by this much in the log of
+# the distance. Isotropic targets reach a third where the axis is known roughly, weakly
+# anisotropic ones three.
 LEAST_GAIN = 1.0
 
 
-def turn_misfits(
-    data: SampleSet, state: Materials, floor: float, n_threads: int
+def distances_by_angle(
+    data: SampleSet, state: SharpAlignment, floor: float, n_threads: int
 ) -> NDArray[np.float64]:
-    """Distance of each texel to its own target after each turn about its normal.
+    """Distance of each texel to its own target after each rotation about its normal.
 
     Parameters
     ----------
     data : SampleSet
         n texels.
-    state : Materials
+    state : SharpAlignment
     floor : float
         See `RefinementOptions`.
     n_threads : int
 
     Returns
     -------
-    (n, N_TURNS) float64
-        The first column: no turn. Some of the views suffice.
+    (n, N_ANGLES) float64
+        The first column: no rotation. Some of the views suffice.
     """
-    data, columns = thinned(data), []
-    for turn in _turns():
-        turned = Materials(state.targets, turn @ state.frames, state.brightness, state.cluster)
-        columns.append(own_misfit(data, turned, floor, n_threads))
+    some = data.thinned(ENOUGH_SAMPLES)
+    columns = [
+        own_distance(some, state.rotated(rotation), floor, n_threads)
+        for rotation in _rotations()
+    ]
     return np.stack(columns, axis=1)
 
 
-def _turns() -> Array:
-    axes = np.tile([0.0, 0.0, 1.0], (N_TURNS, 1))
-    return rotation_about(axes, 2 * np.pi * np.arange(N_TURNS) / N_TURNS)
+def _rotations() -> Array:
+    axes = np.tile([0.0, 0.0, 1.0], (N_ANGLES, 1))
+    return rotation_about(axes, 2 * np.pi * np.arange(N_ANGLES) / N_ANGLES)
 
 
-def best_turns(data: SampleSet, state: Materials, floor: float, n_threads: int) -> Materials:
-    """State with each frame at the best of all turns about its normal."""
-    best = np.argmin(turn_misfits(data, state, floor, n_threads), axis=1)
-    return Materials(
-        state.targets, _turns()[best] @ state.frames, state.brightness, state.cluster
-    )
+def at_best_angles(
+    data: SampleSet, state: SharpAlignment, floor: float, n_threads: int
+) -> SharpAlignment:
+    """Each frame rotated by the best of all angles about its normal."""
+    best = np.argmin(distances_by_angle(data, state, floor, n_threads), axis=1)
+    return state.rotated(_rotations()[best])
 
 
-def turn_margin(
+def angle_margin(
     data: SampleSet,
-    state: Materials,
+    state: SharpAlignment,
     floor: float,
     half_turn: bool,
     n_threads: int,
 ) -> NDArray[np.float64]:
-    """Correlation on the samples less that of the best other turn, (n,); not negative.
+    """Correlation on the samples less that at the best other angle, (n,); not negative.
 
-    A half turn is no other turn if `half_turn` is True.
+    A half turn is no other angle if `half_turn` is True.
     """
-    cosine = np.sqrt(1.0 - turn_misfits(data, state, floor, n_threads))
-    others = [k for k in range(1, N_TURNS) if not (half_turn and k == N_TURNS // 2)]
+    cosine = np.sqrt(1.0 - distances_by_angle(data, state, floor, n_threads))
+    others = [k for k in range(1, N_ANGLES) if not (half_turn and k == N_ANGLES // 2)]
     return np.maximum(cosine[:, 0] - cosine[:, others].max(axis=1), 0.0)
 
 
-def find_turns(
-    data: SampleSet, state: Materials, options: RefinementOptions, n_threads: int
-) -> tuple[Materials, bool]:
-    """Frames and target of one material whose turns about the normal are open.
+def find_angles(
+    data: SampleSet, state: SharpAlignment, options: RefinementOptions, n_threads: int
+) -> tuple[SharpAlignment, bool]:
+    """Frames and target of one material whose in-plane angles are undetermined.
 
     Parameters
     ----------
     data : SampleSet
         n texels.
-    state : Materials
-        One target; normals within some ten degrees, turns of no account.
+    state : SharpAlignment
+        One target; normals within some ten degrees, in-plane angles of no account.
     options : RefinementOptions
     n_threads : int
 
     Returns
     -------
-    state : Materials
+    state : SharpAlignment
     known : bool
-        False if turns explain too little to be known: the reflectance is round, and the
-        frames are turned towards the base frames.
+        False if angles explain too little to be known: the reflectance is isotropic, and the
+        frames are rotated towards the base frames.
     """
-    upright = fold(np.swapaxes(state.frames, 1, 2), Symmetry("all"))
-    state = Materials(
-        state.targets,
-        np.ascontiguousarray(np.swapaxes(upright, 1, 2)),
-        state.brightness.copy(),
-        state.cluster,
-    )
-    for _ in range(ROUND_ROUNDS):
+    base_from_local = np.swapaxes(state.frames, 1, 2)
+    untwisted = reduce_to_fundamental_zone(base_from_local, Symmetry("all"))
+    state = state.rotated(np.swapaxes(untwisted, 1, 2) @ base_from_local)
+    for _ in range(ISOTROPIC_ROUNDS):
         state = one_round(data, state, options, n_threads)
-    begun = _begun_with_least_tilted(data, state, options)
-    for _ in range(TURN_ROUNDS):
-        turned = best_turns(data, begun, options.floor, n_threads)
-        begun = one_round(data, turned, options, n_threads)
-    misfit = np.log(turn_misfits(data, begun, options.floor, n_threads) + FORGIVEN)
-    gain = np.mean(np.median(misfit, axis=1) - misfit[:, 0])
-    return (begun, True) if gain > LEAST_GAIN else (state, False)
+    anisotropic = replace(state, targets=_target_of_least_tilted(data, state, options).targets)
+    for _ in range(ANGLE_ROUNDS):
+        anisotropic = at_best_angles(data, anisotropic, options.floor, n_threads)
+        anisotropic = one_round(data, anisotropic, options, n_threads)
+    distance = distances_by_angle(data, anisotropic, options.floor, n_threads)
+    gain = np.mean(log_improvement(np.median(distance, axis=1), distance[:, 0]))
+    if not gain > LEAST_GAIN:
+        return state, False
+    for _ in range(options.rounds):
+        anisotropic = one_round(data, anisotropic, options, n_threads)
+    return anisotropic, True
 
 
-def _begun_with_least_tilted(
-    data: SampleSet, state: Materials, options: RefinementOptions
-) -> Materials:
-    """Target of the least tilted texel where that is seen, of all texels elsewhere."""
+def _target_of_least_tilted(
+    data: SampleSet, state: SharpAlignment, options: RefinementOptions
+) -> SharpAlignment:
+    """The least tilted texel with its own target; where it sees nothing, with that of all."""
     height = np.where(state.brightness > 0, state.frames[:, 2, 2], -np.inf)
     first = np.array([np.argmax(height)])
-    alone = state.part(first)
-    targets = fit_nodes(
-        data.part(first),
-        alone.frames,
-        alone.brightness,
-        alone.cluster,
-        state.targets,
-        options,
-        1,
-    )
-    return Materials(targets, state.frames, state.brightness, state.cluster)
+    return fit_sharp_targets(data.part(first), state.part(first), options, 1)
+
+
+def improve_with_angles(
+    data: SampleSet,
+    state: SharpAlignment,
+    options: RefinementOptions,
+    in_plane: NDArray[np.bool_],
+    n_threads: int,
+) -> SharpAlignment:
+    """Frames against finished targets, after the best angles of clusters that are `in_plane`.
+
+    Normals that are some degrees off hide the right angle, so both are found in alternation.
+    """
+    rows = np.flatnonzero(in_plane[state.cluster])
+    if len(rows) > 0:
+        some, own = data.part(rows), state.part(rows)
+        for _ in range(ANGLE_PASSES):
+            own = at_best_angles(some, own, options.floor, n_threads)
+            own = choose(some, own, options, options.steps, n_threads)
+        # Which material a texel is of is chosen once all frames are improved.
+        state = state.with_part(rows, replace(own, cluster=state.cluster[rows]))
+    return choose(data, state, options, options.last_steps, n_threads)

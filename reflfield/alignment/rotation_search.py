@@ -10,17 +10,17 @@ from typing import TypedDict, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.alignment.coarse import coarse_peaks
-from reflfield.alignment.correlation import spectrum
-from reflfield.alignment.newton_ascent import (
+from reflfield.alignment.candidate_ascent import (
     APPROACH_DEGREES,
     PEAK_DISTANCE,
-    climb_best,
-    degree_arrays,
-    degrees_of,
-    follow,
-    lowest_z_of,
+    Candidates,
+    Maxima,
+    SearchRules,
+    ascend_best,
 )
+from reflfield.alignment.coarse_search import coarse_peaks
+from reflfield.alignment.correlation import degree_arrays, degrees_of, spectrum
+from reflfield.alignment.newton_ascent import follow, lowest_z_of
 from reflfield.errors import InputError
 from reflfield.sphere.coupling import Coupled
 from reflfield.util.blas_threads import one_core_blas
@@ -52,15 +52,15 @@ class SearchResult:
     Parameters
     ----------
     rotations : (n, 3, 3) float64
-        `base_from_local`: the source is the target turned by this, :math:`a(\omega) \approx
+        `base_from_local`: the source is the target rotated by this, :math:`a(\omega) \approx
         c(R^\top\omega)`. The identity where source or target is zero.
     score : (n,) float64
         Correlation over both norms, in [-1, 1]; 0 for a zero function.
     margin : (n,) float64
-        Score gap to the best rotation at least 15 degrees away: another peak, or the weakest
+        Score gap to the best rotation at least 15 degrees away: another maximum, or the weakest
         direction of this one. Near 0 the rotation is not determined.
     cluster : (n,) int32
-        Target found best.
+        Best target.
     """
 
     rotations: NDArray[np.float64]
@@ -91,7 +91,7 @@ def search(
     start : (n, 3, 3) array_like, optional
         Rotations to try as well (with every finalist target).
     max_tilt : float, optional
-        Largest angle between z and the turned z, radians. None: all rotations.
+        Largest angle between z and the rotated z, radians. None: all rotations.
     n_peaks : int
         Local maxima of the coarse grid that are followed with all degrees.
     half_turns : sequence of bool
@@ -115,7 +115,7 @@ def search(
 
     Examples
     --------
-    A turned function is found again:
+    A rotated function is found again:
 
     >>> from reflfield.sphere.coupling import couple, rotate_coupled
     >>> from scipy.spatial.transform import Rotation
@@ -123,8 +123,8 @@ def search(
     >>> rng = np.random.default_rng(0)
     >>> target = couple(rng.standard_normal((1, 9, 9)).astype(np.float32))
     >>> truth = Rotation.from_euler("ZYZ", [[0.3, 0.5, -0.2]]).as_matrix()
-    >>> found = search(rotate_coupled(target, rotation_blocks(truth, 5)), target)
-    >>> bool(np.abs(found.rotations - truth).max() < 1e-3), float(found.score[0].round(4))
+    >>> result = search(rotate_coupled(target, rotation_blocks(truth, 5)), target)
+    >>> bool(np.abs(result.rotations - truth).max() < 1e-3), float(result.score[0].round(4))
     (True, 1.0)
     """
     _check_search(source, target, max_tilt, n_peaks)
@@ -209,15 +209,6 @@ class _Plan:
     margins: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Rotations in question: those of function ``rows[i]`` are ``first[i] .. first[i + 1]``."""
-
-    rows: NDArray[np.int64]
-    first: NDArray[np.int64]
-    rotations: NDArray[np.float64]
-
-
 def _search_block(
     source: Coupled, start: NDArray[np.float64] | None, plan: _Plan
 ) -> SearchResult:
@@ -248,7 +239,7 @@ def _search_block(
 
 def _candidates(
     peaks: NDArray[np.float64], final: NDArray[np.int64], start: NDArray[np.float64] | None
-) -> _Candidates:
+) -> Candidates:
     """All rotations to follow for the functions `final`."""
     every = peaks[final]
     if start is not None:
@@ -257,13 +248,13 @@ def _candidates(
     real = np.isfinite(flat[:, 0, 0])
     counts = real.reshape(len(final), every.shape[1]).sum(axis=1)
     first = np.concatenate([[0], np.cumsum(counts)])
-    return _Candidates(final, first, flat[real])
+    return Candidates(final, first, flat[real])
 
 
 def _keep_better(
     best: SearchResult,
     series: NDArray[np.floating],
-    candidates: _Candidates,
+    candidates: Candidates,
     k: int,
     plan: _Plan,
 ) -> None:
@@ -272,41 +263,38 @@ def _keep_better(
     if len(who) == 0:
         return
     n_degrees, dtype = degrees_of(series), str(series.dtype)
-    top, at_top = np.zeros((len(who), 3, 3)), np.zeros((len(who), 11))
-    rival = np.zeros(len(who))
-    climb_best(
-        series,
-        who,
-        candidates.first,
-        candidates.rotations,
+    rules = SearchRules(
         lowest_z_of(plan.max_tilt),
-        (bool(plan.half_turns) and plan.half_turns[k], plan.symmetric[k]),
+        bool(plan.half_turns and plan.half_turns[k]),
+        bool(plan.symmetric[k]),
         degree_arrays(min(n_degrees, APPROACH_DEGREES), dtype),
         degree_arrays(n_degrees, dtype),
-        top,
-        at_top,
-        rival,
     )
+    n = len(who)
+    maxima = Maxima(np.zeros((n, 3, 3)), np.zeros((n, 11)), np.zeros(n))
+    ascend_best(series, candidates, rules, maxima)
+    top, at_top = maxima.rotations, maxima.derivatives
     better = at_top[:, 0] > best.score[who]
     best.rotations[who[better]] = top[better]
     best.score[who[better]] = at_top[better, 0]
     best.cluster[who[better]] = k
     if plan.margins:
-        gap = np.minimum(at_top[:, 0] - rival, _gap_of_weakest_turn(series, who, top, at_top))
+        weakest = _gap_of_weakest_rotation(series, who, top, at_top)
+        gap = np.minimum(at_top[:, 0] - maxima.competing, weakest)
         best.margin[who[better]] = np.maximum(gap, 0.0)[better]
 
 
-def _gap_of_weakest_turn(
+def _gap_of_weakest_rotation(
     series: NDArray[np.floating],
     who: NDArray[np.int64],
     top: NDArray[np.float64],
     at_top: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Height above the better of two turns about the axis of least curvature."""
+    """Height above the better of two rotations about the axis of least curvature."""
     hessian = at_top[:, [4, 7, 8, 7, 5, 9, 8, 9, 6]].reshape(-1, 3, 3)
     axis = np.linalg.eigh(hessian)[1][:, :, 2]
-    turned = [top @ rotation_about(axis, angle) for angle in (PEAK_DISTANCE, -PEAK_DISTANCE)]
-    both = np.stack(turned, axis=1).reshape(-1, 3, 3)
+    rotated = [top @ rotation_about(axis, angle) for angle in (PEAK_DISTANCE, -PEAK_DISTANCE)]
+    both = np.stack(rotated, axis=1).reshape(-1, 3, 3)
     values = follow(series, np.repeat(who, 2), both, 0)[1][:, 0]
     return at_top[:, 0] - values.reshape(-1, 2).max(axis=1)
 

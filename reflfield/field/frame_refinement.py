@@ -14,10 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.newton_ascent import copy_matrix
-from reflfield.alignment.newton_ascent import scale as shrink
-from reflfield.alignment.refinement import hold, solve_step, turn_frame
-from reflfield.alignment.splines import FAST
+from reflfield.alignment.gauss_newton import hold, rotate_left, solve_step
+from reflfield.alignment.rotation_steps import copy_matrix
+from reflfield.alignment.rotation_steps import scale_vector as shrink
+from reflfield.alignment.spline_targets import FAST
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.observations.texel_samples import POWERS, root
@@ -199,7 +199,7 @@ def _refine_texel(
                 break
         else:
             shrink(step, 4, 0.25)
-        turn_frame(best, step, turn, frame)
+        rotate_left(best, step, turn, frame)
         factor = np.exp(step[3])
 
 

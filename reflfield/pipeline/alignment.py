@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment import RefinementOptions, align
-from reflfield.alignment.refinement import SampleSet
-from reflfield.alignment.scattered import (
-    SharpTargets,
-    improved_block,
-    in_gauge_of,
-    sharp_targets,
-)
-from reflfield.alignment.splines import NodeTargets
+from reflfield.alignment import RefinementOptions, SampleSet
+from reflfield.alignment.align_texels import checked_options, frames_of
+from reflfield.alignment.alignment_model import AlignmentModel
+from reflfield.alignment.model_arrays import arrays_of_model, model_of_arrays
+from reflfield.alignment.model_fit import FitOptions, fit_model
+from reflfield.alignment.sample_sources import GriddedSamples, ScatteredSource
 from reflfield.observations.texel_reading import LUMINANCE, TexelReader
 from reflfield.observations.texel_samples import unroot
 from reflfield.pipeline.context import Job
@@ -29,7 +26,10 @@ Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
 # On raw samples: a few rounds, the targets on texels enough for grids of this side.
-REFINEMENT = RefinementOptions(side=25, rounds=4, texels_per_cluster=8192)
+REFINEMENT = RefinementOptions(
+    side=25, rounds=4, texels_per_cluster=8192, samples_per_pair=64.0
+)
+ENTRIES = ("local_from_base", "cluster", "score", "margin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,18 +60,14 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
     }
     keep = np.zeros(len(job.seen_texels), bool)
     if job.options.alignment.enabled and max(job.sides) > 1:
-        blocks = job.blocks(folder)
-        found = blocks.once("harmonic search", lambda: aligned(job))
+        entries = aligned(job, job.blocks(folder))
         seen = job.seen_texels
-        keep = found["margin"] >= job.options.alignment.least_margin
+        keep = entries["margin"] >= job.options.alignment.least_margin
         arrays["aligned"][seen[keep]] = True
-        local_from_base = found["local_from_base"]
-        if job.options.alignment.refine:
-            local_from_base = refined(job, local_from_base, found["cluster"], blocks)
-        frames[seen[keep]] = local_from_base[keep]
+        frames[seen[keep]] = entries["local_from_base"][keep]
         for name in ("cluster", "score", "margin"):
-            arrays[name][seen] = found[name]
-        arrays["history"] = found["history"]
+            arrays[name][seen] = entries[name]
+        arrays["history"] = entries["history"]
     np.savez(folder / "alignment.npz", local_from_base=frames, **arrays)
     n_aligned = int(keep.sum())
     moved = np.degrees(np.arccos(np.clip(frames[:, 2, 2], -1, 1)))
@@ -94,9 +90,66 @@ def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
     return (local_from_base @ job.texels.local_from_world).astype(np.float32)
 
 
-def aligned(job: Job) -> dict[str, NDArray[Any]]:
-    """Alignment of the completed texels that have samples: the arrays of `Alignment`."""
+def aligned(job: Job, blocks: Blocks) -> dict[str, NDArray[Any]]:
+    """Alignment of the texels that have samples: a model of all, then frames by blocks."""
+    seen, reader = job.seen_texels, job.base_reader
+    gridded = completed_luminance(job)
+    raw: ScatteredSource = gridded
+    if job.options.alignment.refine:
+        raw = RawLuminance(reader, seen, job.resources.block_bytes)
+    options = fit_options(job, gridded)
+    model = blocks.once(
+        "alignment model", lambda: arrays_of_model(fit_model(gridded, raw, options))
+    )
+    rows = [np.searchsorted(seen, some) for some in reader.blocks_of(seen)]
+    shared = Aligning(model_of_arrays(model), gridded, raw)
+    parts = blocks.map("frames of all texels", aligned_block, shared, rows)
+    return {name: parts.joined(name) for name in ENTRIES} | {"history": model["history"]}
+
+
+@dataclass(frozen=True, eq=False)
+class Aligning:
+    """What all blocks of texels that are aligned share.
+
+    Parameters
+    ----------
+    model : AlignmentModel
+    gridded : GriddedSamples
+    raw : ScatteredSource
+    """
+
+    model: AlignmentModel
+    gridded: GriddedSamples
+    raw: ScatteredSource
+
+
+def aligned_block(shared: Aligning, rows: Indices) -> dict[str, NDArray[Any]]:
+    """Frames of some texels."""
+    frames = frames_of(shared.model, shared.gridded, shared.raw, rows)
+    return {name: getattr(frames, name) for name in ENTRIES}
+
+
+def fit_options(job: Job, gridded: GriddedSamples) -> FitOptions:
+    """Options of the model, with band limits that the grids support."""
     options = job.options.alignment
+    spread = np.radians(options.spread_deg)
+    limits = (_band_limit(options.band_limit, d) for d in (gridded.views, gridded.lights))
+    return checked_options(
+        gridded,
+        FitOptions(
+            band_limits=(next(limits), next(limits)),
+            iterations=options.iterations,
+            n_clusters=options.n_clusters,
+            refinement=replace(REFINEMENT, spread=spread) if options.refine else None,
+            seed=job.options.seed,
+            max_tilt=np.radians(options.max_tilt_deg),
+            n_threads=job.resources.workers,
+        ),
+    )
+
+
+def completed_luminance(job: Job) -> GriddedSamples:
+    """Completed texels that have samples, at the nodes of the grids."""
     stored = job.result("completion", "completion.npz")
     source = CompletedLuminance(
         mean=stored["mean"],
@@ -106,21 +159,7 @@ def aligned(job: Job) -> dict[str, NDArray[Any]]:
         domain=job.options.resampling.domain,
     )
     view, light = (HemisphereGrid(side).directions for side in job.sides)
-    limits = tuple(_band_limit(options.band_limit, d) for d in (view, light))
-    found = align(
-        source,
-        view,
-        light,
-        band_limit=(limits[0], limits[1]),
-        iterations=options.iterations,
-        n_clusters=options.n_clusters,
-        refine=False,
-        seed=job.options.seed,
-        max_tilt=np.radians(options.max_tilt_deg),
-        n_threads=job.resources.workers,
-    )
-    names = ("local_from_base", "cluster", "score", "margin", "history")
-    return {name: getattr(found, name) for name in names}
+    return GriddedSamples.checked(source, view, light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,72 +238,6 @@ class RawLuminance:
             views=np.concatenate([part.views for part in parts]),
             lights=np.concatenate([part.lights for part in parts]),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Refining:
-    """What all blocks of texels whose frames are refined share.
-
-    Parameters
-    ----------
-    source : RawLuminance
-    frames : (n, 3, 3) float64
-        Of the harmonic search.
-    cluster : (n,) int32
-    sharp : SharpTargets
-    """
-
-    source: RawLuminance
-    frames: NDArray[np.float64]
-    cluster: NDArray[np.int32]
-    sharp: SharpTargets
-
-
-def refined(
-    job: Job,
-    frames: NDArray[np.float64],
-    cluster: NDArray[np.int32],
-    blocks: Blocks,
-) -> NDArray[np.float64]:
-    """Frames of the texels that have samples: `refine_scattered` by blocks."""
-    seen = job.seen_texels
-    source = RawLuminance(job.base_reader, seen, job.resources.block_bytes)
-    options = replace(REFINEMENT, spread=np.radians(job.options.alignment.spread_deg))
-
-    def targets() -> dict[str, NDArray[Any]]:
-        found = sharp_targets(
-            source,
-            frames,
-            cluster,
-            options,
-            seed=job.options.seed,
-            n_threads=job.resources.workers,
-        )
-        return {
-            "values": found.targets.values,
-            "sides": np.array(found.targets.sides),
-            "side": np.array(found.options.side),
-        }
-
-    found = blocks.once("sharp targets", targets)
-    view_side, light_side = (int(side) for side in found["sides"])
-    sharp = SharpTargets(
-        NodeTargets(found["values"], view_side, light_side),
-        replace(options, side=int(found["side"])),
-    )
-    rows = [np.searchsorted(seen, some) for some in job.base_reader.blocks_of(seen)]
-    parts = blocks.map(
-        "frames on the samples", refined_block, Refining(source, frames, cluster, sharp), rows
-    )
-    return in_gauge_of(frames, parts.joined("frames"), cluster)
-
-
-def refined_block(context: Refining, rows: Indices) -> dict[str, NDArray[Any]]:
-    """Frames of some texels, refined on their samples."""
-    frames = improved_block(
-        context.source.read(rows), context.frames[rows], context.cluster[rows], context.sharp
-    )
-    return {"frames": frames}
 
 
 def _band_limit(wanted: int, directions: NDArray[np.float64]) -> int:

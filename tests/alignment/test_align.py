@@ -40,12 +40,12 @@ def test_normals_come_back_and_refinement_makes_them_sharp(relief, aligned, scen
     # The band limit and the cut at the horizon leave degrees, the samples a tenth of one.
     assert coarse.mean() < 3.0
     assert fine.mean() < 0.3
-    # The mean tangent is a gauge: the base frames', not the truth's.
+    # The mean tangent is a convention: the base frames', not the truth's.
     assert tangent.mean() < 5.0
     assert aligned.symmetries == ("half",)
 
 
-def test_refined_frames_share_no_turn(relief, aligned):
+def test_refined_frames_share_no_rotation(relief, aligned):
     """The axis of symmetry that is their normal is found on the samples."""
     common = mean_rotation(
         aligned.local_from_base @ np.swapaxes(relief[0], 1, 2), np.ones(len(relief[0]))
@@ -125,8 +125,8 @@ def test_blocks_from_a_source_give_the_same_as_an_array(relief, monkeypatch):
         def read(self, rows):
             return samples[rows]
 
-    monkeypatch.setattr("reflfield.alignment.aligning.TRAINING_TEXELS", 60)
-    block_bytes = "reflfield.alignment.alignment_samples.BLOCK_BYTES"
+    monkeypatch.setattr("reflfield.alignment.model_fit.TRAINING_TEXELS", 60)
+    block_bytes = "reflfield.alignment.sample_sources.BLOCK_BYTES"
     monkeypatch.setattr(block_bytes, samples[0].nbytes * 7)
     one = align(samples, directions, directions, iterations=2)
     two = align(Disk(), directions, directions, iterations=2, n_threads=2)
@@ -136,21 +136,31 @@ def test_blocks_from_a_source_give_the_same_as_an_array(relief, monkeypatch):
 
 def test_texels_outside_the_training_are_as_good(relief, scene, monkeypatch):
     frames, directions, samples = relief
-    monkeypatch.setattr("reflfield.alignment.aligning.TRAINING_TEXELS", 60)
+    monkeypatch.setattr("reflfield.alignment.model_fit.TRAINING_TEXELS", 60)
     result = align(samples, directions, directions)
     assert scene.frame_errors(result.local_from_base, frames)[0].mean() < 0.5
 
 
-@pytest.mark.parametrize("one", ["view", "light"])
-def test_one_view_or_one_light_must_simply_work(one, relief, scene):
+def mean_errors(found, truth, scene):
+    """Mean error of normals, degrees: of the recovered frames, and of the base frames."""
+    base = np.tile(np.eye(3), (len(truth), 1, 1))
+    return (scene.frame_errors(frames, truth)[0].mean() for frames in (found, base))
+
+
+@pytest.mark.parametrize(("one", "share"), [("view", 0.7), ("light", 0.95)])
+def test_one_view_or_one_light_brings_normals_closer_than_the_base_frames(
+    one, share, relief, scene
+):
     frames, directions, _ = relief
     top = np.array([[0.0, 0.0, 1.0]])
     views, lights = (top, directions) if one == "view" else (directions, top)
     samples = scene.sample_texels(frames, views, lights)
     result = align(samples, views, lights, max_tilt=1.0)
-    # One light fixes no tangent and a mirror direction fixes no normal alone.
     assert np.isfinite(result.local_from_base).all()
-    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < 25.0
+    recovered, base = mean_errors(result.local_from_base, frames, scene)
+    # Of the base frames' error 52 % are left with one view, which the light's cosine helps, and
+    # 85 % with one light, under which only half vectors tell; identity frames leave all.
+    assert recovered < share * base
 
 
 @pytest.mark.stability
@@ -228,8 +238,7 @@ def test_scene_of_the_paper_to_the_accuracy_of_the_design(scene):
     assert normals.mean() < 0.1
 
 
-def test_rotations_of_unrelated_axes_share_one_gauge(rng, relief, scene):
-    """Turning all base frames by one small rotation turns the recovered frames along."""
+def test_rotating_all_base_frames_rotates_the_recovered_frames_along(relief, scene):
     frames, d, _ = relief
     turn = Rotation.from_euler("z", 0.7).as_matrix()
     here = scene.sample_texels(frames, d, d)

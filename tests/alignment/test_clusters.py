@@ -1,13 +1,16 @@
 """Materials told apart: on the samples, and by harmonics alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from reflfield.alignment import RefinementOptions, align, aligning
-from reflfield.alignment.materials import Materials, misfits, residual_features, tell_apart
-from reflfield.alignment.refinement import SampleSet
-from reflfield.alignment.splines import NodeTargets
+from reflfield.alignment import RefinementOptions, SampleSet, align, in_plane_rotation
+from reflfield.alignment.material_clusters import tell_apart
+from reflfield.alignment.material_distance import distances, residual_features
+from reflfield.alignment.refinement import SharpAlignment
+from reflfield.alignment.spline_targets import SplineTargets
 from reflfield.sphere.hemisphere import LOWEST_Z
 from reflfield.sphere.rotations import frames_from_normals
 
@@ -84,7 +87,7 @@ def mixed_relief(scene, materials, n):
 
 
 @pytest.mark.slow
-def test_a_material_whose_turns_the_samples_tell_leaves_the_other_as_it_is(scene):
+def test_a_material_whose_in_plane_angles_the_samples_tell_leaves_the_other_as_it_is(scene):
     frames, d, samples, label = mixed_relief(scene, (SIMILAR[0], FAR_APART[1]), 240)
     found = align(samples, d, d, n_clusters=2, n_threads=2)
     assert agreement(found.cluster, label) == 1.0
@@ -123,56 +126,56 @@ def test_scores_belong_to_the_cluster_that_texels_end_in(scene, rng, monkeypatch
     _, d, samples, _ = mixture(scene, rng, FAR_APART[1:3], 80)
     options = RefinementOptions(side=9, rounds=1, last_steps=3)
     right = align(samples, d, d, n_clusters=2, refine=options)
-    original = aligning.choose
+    original = in_plane_rotation.choose
 
     def contrary(data, state, options, n_steps, n_threads):
         chosen = original(data, state, options, n_steps, n_threads)
         if n_steps == options.last_steps:
-            chosen.cluster[:] = 1 - chosen.cluster
+            return replace(chosen, cluster=1 - chosen.cluster)
         return chosen
 
-    monkeypatch.setattr(aligning, "choose", contrary)
+    monkeypatch.setattr(in_plane_rotation, "choose", contrary)
     wrong = align(samples, d, d, n_clusters=2, refine=options)
     assert np.array_equal(wrong.cluster, 1 - right.cluster)
     assert wrong.score.mean() < right.score.mean() - 0.02
 
 
 @pytest.fixture
-def crude_state(scene, rng):
+def crude(scene, rng):
     """A few texels with gaps, frames, and two random targets on nodes."""
     frames = tilted_frames(rng, 6)
     d = scene.dome_directions()
     samples = scene.sample_texels(frames, d, d)
     samples[rng.random(samples.shape) < 0.2] = np.nan
     values = rng.uniform(0.1, 1.0, (2, 49, 49)).astype(np.float32)
-    return SampleSet(samples, d, d), frames, NodeTargets(values, 7, 7)
+    data = SampleSet(samples, d, d)
+    cluster = (np.arange(6) % 2).astype(np.int32)
+    return data, SharpAlignment.begin(data, frames, cluster, SplineTargets(values, 7, 7))
 
 
 @pytest.mark.reference
-def test_distance_is_that_of_dense_interpolation(crude_state, references):
-    data, frames, targets = crude_state
+def test_distance_is_that_of_dense_interpolation(crude, references):
+    data, state = crude
     floor = 0.3
-    found = misfits(data, frames, targets, floor, 1)
-    for i, frame in enumerate(frames):
+    computed = distances(data, state, floor, 1)
+    for i, frame in enumerate(state.frames):
         local = data.views @ frame.T
         dense = references.spline_matrix(local, 7)
         y = data.samples[i].astype(np.float64)
         seen = np.isfinite(y) & np.outer(local[:, 2] >= LOWEST_Z, local[:, 2] >= LOWEST_Z)
         w = 1.0 / (floor * data.brightness()[i] + np.abs(y[seen]))
         for k in range(2):
-            m = (dense @ targets.values[k].astype(np.float64) @ dense.T)[seen]
+            m = (dense @ state.targets.values[k].astype(np.float64) @ dense.T)[seen]
             cosine = (w * y[seen]) @ m / np.sqrt((w * y[seen]) @ y[seen] * (w * m) @ m)
             # Interpolation is in float32, a few roundings of values near 1.
-            assert abs(found[i, k] - (1.0 - cosine**2)) < 1e-5
+            assert abs(computed[i, k] - (1.0 - cosine**2)) < 1e-5
 
 
-def test_features_are_a_part_of_the_distance(crude_state):
-    data, frames, targets = crude_state
-    cluster = (np.arange(6) % 2).astype(np.int32)
-    state = Materials(targets, frames, data.brightness(), cluster)
+def test_features_are_a_part_of_the_distance(crude):
+    data, state = crude
     distance, features = residual_features(data, state, 0.3, 1)
-    both = misfits(data, frames, targets, 0.3, 1)
-    np.testing.assert_allclose(distance, both[np.arange(6), cluster], atol=1e-12)
+    both = distances(data, state, 0.3, 1)
+    np.testing.assert_allclose(distance, both[np.arange(6), state.cluster], atol=1e-12)
     part = np.sum(features.astype(np.float64) ** 2, axis=1)
     # Averages over nodes cannot hold more than the whole (Cauchy and Schwarz).
     assert np.all(part > 0.05 * distance)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment.coarse import (
+from reflfield.alignment.coarse_search import (
     COARSE_DEGREES,
     COARSE_ORBITS,
     coarse_grid,

@@ -110,7 +110,7 @@ def test_half_turn_symmetry_has_two_equal_peaks_and_a_margin_that_knows_it(rng):
     assert error.max() < 0.05
 
 
-def test_peak_behind_a_saddle_is_not_given_up(scene):
+def test_maximum_behind_a_saddle_is_not_pruned(scene):
     """Texels whose approach with few degrees ends at a saddle of the whole series."""
     texels = [1910, 2034, 3666, 7493, 7625, 9124, 9125, 9249, 9250, 9251]
     frames, directions = scene.relief_frames()[texels], scene.dome_directions(scene.RINGS_151)
@@ -126,7 +126,7 @@ def test_peak_behind_a_saddle_is_not_given_up(scene):
     np.testing.assert_allclose(found.score, peaks[:, 0] / source.norms(), rtol=1e-3)
 
 
-def test_rotational_symmetry_leaves_the_turn_and_nothing_else_open(scene):
+def test_rotational_symmetry_leaves_the_in_plane_angle_and_nothing_else_undetermined(scene):
     d = scene.dome_directions()
     frames = scene.relief_frames(20, 12)[::3]
     samples = scene.sample_texels(frames, d, d, nu=20.0, nv=20.0)

@@ -4,7 +4,11 @@ from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import align
 from reflfield.alignment.expectation_maximisation import TargetFit
-from reflfield.alignment.horizon import Horizon, extend_targets, settle
+from reflfield.alignment.horizon_imputation import (
+    Horizon,
+    impute_and_ascend,
+    impute_targets,
+)
 from reflfield.alignment.rotation_search import search
 from reflfield.sphere.coupling import Coupled, couple, rotate_coupled
 from reflfield.sphere.harmonic_projection import Projector
@@ -29,7 +33,7 @@ def test_unseen_part_of_the_target_itself_is_found_exactly(horizon, dtype, rng, 
     target = couple(rng.standard_normal((1, 36, 36)).astype(dtype))
     turns = Rotation.random(7, random_state=0).as_matrix()
     whole = turned(target, turns).scaled(np.linspace(0.2, 3.0, 7))
-    found = horizon.extended(horizon.seen(whole), target, turns)
+    found = horizon.imputed(horizon.seen(whole), target, turns)
     # Two products with operators of 36 rows, stored in float32, and two recombinations.
     tolerance = rounding(np.float32, operations=4 * 36, scale=float(whole.norms().max()))
     for a, b in zip(found.blocks, whole.blocks, strict=True):
@@ -42,32 +46,32 @@ def test_zero_functions_and_opposites_are_left_alone(horizon, rng):
     turns = np.tile(np.eye(3), (2, 1, 1))
     seen = horizon.seen(turned(target, turns))
     hard = seen.scaled(np.array([0.0, -1.0]))
-    for a, b in zip(horizon.extended(hard, target, turns).blocks, hard.blocks, strict=True):
+    for a, b in zip(horizon.imputed(hard, target, turns).blocks, hard.blocks, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_settling_finds_rotations_of_functions_cut_at_the_horizon(horizon, rng):
+def test_imputation_finds_rotations_of_functions_cut_at_the_horizon(horizon, rng):
     falling = 1.0 / (1.0 + np.floor(np.sqrt(np.arange(36)))) ** 2
     target = couple(rng.standard_normal((1, 36, 36)) * falling[:, None] * falling).units()
     turns = Rotation.from_rotvec(rng.normal(0, 0.4, (40, 3))).as_matrix()
     cut = horizon.seen(turned(target, turns))
     found = search(cut, target)
-    settled = settle(cut, target, found, horizon, 30, OPTIONS)
+    imputed = impute_and_ascend(cut, target, found, horizon, 30, OPTIONS)
 
     def error(rotations):
         chord = np.linalg.norm(rotations - turns, axis=(1, 2)) / np.sqrt(2.0)
         return np.rad2deg(np.median(chord))
 
     assert error(found.rotations) > 2.0
-    assert error(settled.rotations) < 0.5  # where the steps of a round fall below .05 degrees
+    assert error(imputed.rotations) < 0.5  # where the steps of a round fall below .05 degrees
 
 
-def test_history_of_the_extension_never_falls(horizon, rng):
+def test_history_of_the_imputation_never_falls(horizon, rng):
     target = couple(rng.standard_normal((1, 36, 36))).units()
     turns = Rotation.from_rotvec(rng.normal(0, 0.3, (30, 3))).as_matrix()
     cut = horizon.seen(turned(target, turns))
     fit = TargetFit(target, search(cut, target), np.array([0.1]))
-    history = extend_targets(cut, fit, horizon, 5, OPTIONS).history
+    history = impute_targets(cut, fit, horizon, 5, OPTIONS).history
     assert len(history) > 1
     assert (np.diff(history) >= 0).all()
 

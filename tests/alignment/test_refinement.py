@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from reflfield.alignment.gauss_newton import hold
 from reflfield.alignment.refinement import (
     RefinementOptions,
-    SampleSet,
-    fit_nodes,
-    hold,
+    SharpAlignment,
+    fit_sharp_targets,
     improve_frames,
-    refine_targets,
+    refine,
 )
-from reflfield.alignment.splines import NodeTargets
+from reflfield.alignment.sample_sources import SampleSet
+from reflfield.alignment.spline_targets import SplineTargets
 from reflfield.errors import InputError, ShapeError
 
 OPTIONS = RefinementOptions(side=11, rounds=3)
@@ -30,8 +31,16 @@ def relief(scene):
     return SampleSet(samples, views, lights), off.as_matrix() @ truth, truth
 
 
+def begun(data, frames, targets=None):
+    """All texels of one cluster in these frames."""
+    if targets is None:
+        targets = SplineTargets.zeros(1, data.samples.shape[1:], OPTIONS.side)
+    return SharpAlignment.begin(data, frames, np.zeros(len(frames), np.int32), targets)
+
+
 def refined(data, frames):
-    return refine_targets(data, frames, np.zeros(len(frames), np.int32), 1, OPTIONS)
+    state = refine(data, begun(data, frames), OPTIONS, 1)
+    return state.targets, state.frames
 
 
 def test_directions_given_for_each_texel_give_the_same_as_common_ones(relief):
@@ -51,10 +60,10 @@ def test_turning_each_base_frame_turns_the_answer_along(relief, rng):
     back = np.swapaxes(turn, 1, 2)
     turned = SampleSet(data.samples, data.views @ back, data.lights @ back)
     _, frames = refined(data, start)
-    _, found = refined(turned, start @ back)
+    _, other = refined(turned, start @ back)
     # Six Gauss-Newton steps against targets in float32, of condition about a hundred; a texel
     # whose step is judged the other way by rounding may end a quarter of a small step apart.
-    error = np.abs(found @ turn - frames).max(axis=(1, 2))
+    error = np.abs(other @ turn - frames).max(axis=(1, 2))
     assert np.median(error) < 1e2 * 6 * np.finfo(np.float32).eps
     assert error.max() < 1e-3
 
@@ -79,11 +88,8 @@ def test_directions_of_other_texels_are_refused(relief):
 def sharp(relief):
     """Target fitted to all samples in the true frames, and those frames."""
     data, _, truth = relief
-    n = len(truth)
-    empty = NodeTargets(np.zeros((1, 11**2, 11**2), np.float32), 11, 11)
     options = RefinementOptions(side=11, fit_steps=12)
-    cluster = np.zeros(n, np.int32)
-    return fit_nodes(data, truth, data.brightness(), cluster, empty, options, 1)
+    return fit_sharp_targets(data, begun(data, truth), options, 1).targets
 
 
 def error_of(frames, truth):
@@ -94,12 +100,9 @@ def error_of(frames, truth):
 
 def improved(relief, sharp, samples, spread):
     data, start, _ = relief
-    frames = start.copy()
     some = SampleSet(samples.astype(np.float32), data.views, data.lights)
-    cluster = np.zeros(len(frames), np.int32)
     options = RefinementOptions(side=11, spread=spread)
-    improve_frames(some, frames, some.brightness(), cluster, sharp, options, 8, 1)
-    return frames
+    return improve_frames(some, begun(some, start, sharp), options, 8, 1).frames
 
 
 @pytest.mark.stability

@@ -8,10 +8,18 @@ from scipy.spatial.transform import Rotation
 from reflfield.alignment.refinement import (
     LEAST_TOUCH,
     RefinementOptions,
-    SampleSet,
-    fit_nodes,
+    SharpAlignment,
+    fit_sharp_targets,
 )
-from reflfield.alignment.splines import NodeTargets, back_project, expect, place
+from reflfield.alignment.sample_sources import SampleSet
+from reflfield.alignment.spline_targets import (
+    SplineTargets,
+    Texels,
+    back_project,
+    empty_placement,
+    expect,
+    place,
+)
 
 SIDE, FLOOR = 9, 0.3
 
@@ -25,18 +33,29 @@ def upper(rng, n, lowest=0.1):
 
 
 def placed(directions, frame, side=SIDE):
-    n = len(directions)
-    first, taps = np.zeros(n, np.int64), np.zeros((n, 4, 4), np.float32)
-    turns = np.zeros((n, 6), np.float32)
-    place(directions, frame, side, first, taps, turns)
-    return first, taps, turns
+    placement = empty_placement(len(directions), side)
+    place(directions, frame, placement)
+    return placement
+
+
+def fitted(data, frames, brightness, options):
+    """Nodes of one target fitted from zero."""
+    state = SharpAlignment(
+        SplineTargets.zeros(1, data.samples.shape[1:], SIDE),
+        frames,
+        brightness,
+        np.zeros(len(frames), np.int32),
+        frames,
+    )
+    return fit_sharp_targets(data, state, options, 1).targets.values
 
 
 @pytest.mark.reference
 def test_taps_are_scipys_splines(references, rng, rounding):
     frame = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
     directions = upper(rng, 200, 0.4)
-    first, taps, _ = placed(directions, frame)
+    placement = placed(directions, frame)
+    first, taps = placement.first, placement.taps
     ours = np.zeros((200, SIDE * SIDE))
     for i in range(200):
         for a in range(4):
@@ -47,7 +66,7 @@ def test_taps_are_scipys_splines(references, rng, rounding):
     )
 
 
-def test_turns_are_derivatives_of_the_place(rng):
+def test_slopes_are_derivatives_of_the_place(rng):
     directions, h = upper(rng, 50, 0.3), 1e-6
     frame = Rotation.from_rotvec([0.05, 0.1, -0.2]).as_matrix()
 
@@ -55,11 +74,11 @@ def test_turns_are_derivatives_of_the_place(rng):
         local = directions @ (Rotation.from_rotvec(turn).as_matrix() @ frame).T
         return 0.5 * (SIDE - 3) * local[:, :2] / np.sqrt(1 + local[:, 2:])
 
-    turns = placed(directions, frame)[2]
+    slopes = placed(directions, frame).slopes
     for k, axis in enumerate(h * np.eye(3)):
         slope = (position(axis) - position(-axis)) / (2 * h)
         # Float32 of numbers of order SIDE; differences err by h squared and eps / h.
-        np.testing.assert_allclose(turns[:, [k, 3 + k]], slope, atol=1e-5)
+        np.testing.assert_allclose(slopes[:, [k, 3 + k]], slope, atol=1e-5)
 
 
 @pytest.fixture
@@ -98,8 +117,9 @@ def test_sums_are_those_of_the_dense_matrices(problem, dense, rng, rounding):
     nodes = rng.standard_normal((SIDE**2, SIDE**2)).astype(np.float32)
     sums, touched = np.zeros(nodes.shape), np.zeros(nodes.shape)
     views, lights = data.directions()
-    arguments = (data.samples, views, lights, frames, brightness, nodes, (SIDE, SIDE), FLOOR)
-    back_project(*arguments, True, sums, touched)
+    sides = (SIDE, SIDE)
+    texels = Texels(data.samples, views, lights, frames, brightness, sides, FLOOR)
+    back_project(texels, nodes, True, sums, touched)
     tolerance = rounding(np.float32, operations=256 + len(y), scale=np.abs(t.T @ (w * y)).max())
     np.testing.assert_allclose(
         sums.ravel(), t.T @ (w * (y - t @ nodes.ravel())), atol=tolerance
@@ -108,7 +128,7 @@ def test_sums_are_those_of_the_dense_matrices(problem, dense, rng, rounding):
     np.testing.assert_allclose(touched.ravel(), t.T @ (w * scale), atol=tolerance)
     # Without samples: the product with the normal equations, with its sign turned.
     sums[:], before = 0.0, touched.copy()
-    back_project(*arguments, False, sums, touched)
+    back_project(texels, nodes, False, sums, touched)
     np.testing.assert_allclose(sums.ravel(), -t.T @ (w * (t @ nodes.ravel())), atol=tolerance)
     np.testing.assert_array_equal(touched, before)
 
@@ -116,11 +136,10 @@ def test_sums_are_those_of_the_dense_matrices(problem, dense, rng, rounding):
 def test_expected_samples_are_those_of_dense_matrices(problem, references, rng, rounding):
     data, frames, _ = problem
     nodes = rng.standard_normal((SIDE**2, SIDE**2)).astype(np.float32)
-    v_first, v_taps, _ = placed(data.views, frames[0])
-    l_first, l_taps, _ = placed(data.lights, frames[0])
-    l_first[2] = -1
+    view, light = placed(data.views, frames[0]), placed(data.lights, frames[0])
+    light.first[2] = -1
     line, out = np.zeros(SIDE**2, np.float32), np.zeros((7, 5), np.float32)
-    expect(nodes, (SIDE, SIDE), (v_first, l_first), (v_taps, l_taps), line, out)
+    expect(nodes, view, light, line, out)
     views, lights = (
         references.spline_matrix(directions @ frames[0].T, SIDE)
         for directions in (data.views, data.lights)
@@ -137,10 +156,8 @@ def test_expected_samples_are_those_of_dense_matrices(problem, references, rng, 
 def test_fit_takes_the_steps_of_scipys_conjugate_gradients(problem, dense, n_steps):
     data, frames, brightness = problem
     t, y, w = dense
-    empty = NodeTargets(np.zeros((1, SIDE**2, SIDE**2), np.float32), SIDE, SIDE)
     options = RefinementOptions(side=SIDE, fit_steps=n_steps)
-    label = np.zeros(len(frames), np.int32)
-    found = fit_nodes(data, frames, brightness, label, empty, options, 1).values.ravel()
+    nodes = fitted(data, frames, brightness, options).ravel()
     scale = np.repeat(brightness, [np.isfinite(s).sum() for s in data.samples])
     touched = t.T @ (w * scale)
     size = (len(touched), len(touched))
@@ -149,17 +166,13 @@ def test_fit_takes_the_steps_of_scipys_conjugate_gradients(problem, dense, n_ste
     expected = cg(normal, t.T @ (w * y), M=divide, rtol=0.0, maxiter=n_steps)[0]
     # Float32 products; each step multiplies their error by a few.
     tolerance = 3.0**n_steps * 1e2 * np.finfo(np.float32).eps * np.abs(expected).max()
-    np.testing.assert_allclose(found, expected, atol=tolerance)
+    np.testing.assert_allclose(nodes, expected, atol=tolerance)
 
 
 @pytest.mark.stability
 def test_texels_that_show_nothing_leave_the_target_alone(problem):
     data, frames, _ = problem
-    empty = NodeTargets(np.zeros((1, SIDE**2, SIDE**2), np.float32), SIDE, SIDE)
-    label, options = np.zeros(len(frames), np.int32), RefinementOptions(side=SIDE)
-    dark = fit_nodes(data, frames, np.zeros(len(frames)), label, empty, options, 1)
-    np.testing.assert_array_equal(dark.values, empty.values)
+    options = RefinementOptions(side=SIDE)
+    assert not fitted(data, frames, np.zeros(len(frames)), options).any()
     black = SampleSet(np.zeros_like(data.samples), data.views, data.lights)
-    ones = np.ones(len(frames))
-    found = fit_nodes(black, frames, ones, label, empty, options, 1)
-    np.testing.assert_array_equal(found.values, empty.values)
+    assert not fitted(black, frames, np.ones(len(frames)), options).any()

@@ -1,15 +1,21 @@
-"""Turns about the normal that only the samples tell."""
+"""In-plane angles that only the samples tell."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reflfield.alignment import RefinementOptions, align
-from reflfield.alignment.frame_ambiguity import fix_gauge, turns_are_open
-from reflfield.alignment.in_plane_rotation import N_TURNS, best_turns, turn_margin, turn_misfits
-from reflfield.alignment.materials import Materials
-from reflfield.alignment.refinement import SampleSet
-from reflfield.alignment.splines import NodeTargets
+from reflfield.alignment import RefinementOptions, SampleSet, align
+from reflfield.alignment.frame_ambiguity import in_plane_undetermined, resolve_ambiguity
+from reflfield.alignment.in_plane_rotation import (
+    N_ANGLES,
+    angle_margin,
+    at_best_angles,
+    distances_by_angle,
+)
+from reflfield.alignment.refinement import SharpAlignment
+from reflfield.alignment.spline_targets import SplineTargets
 from reflfield.sphere.coupling import couple
 from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.hemisphere import HemisphereGrid
@@ -17,7 +23,7 @@ from reflfield.sphere.hemisphere import HemisphereGrid
 QUICK = RefinementOptions(side=13, rounds=3, last_steps=3)
 
 
-def frames_of_any_turn(rng, n, tilt):
+def frames_of_any_angle(rng, n, tilt):
     """Tilts uniform in angle up to `tilt` degrees, any azimuth, any turn."""
     azimuth, turn = rng.uniform(0, 2 * np.pi, (2, n))
     angles = np.stack([azimuth, rng.uniform(0, np.deg2rad(tilt), n), turn - azimuth], axis=1)
@@ -32,7 +38,7 @@ def leaning(local, lean):
     return np.where(seen, (1.0 + lean * both) * up[:, None, :], 0.0).astype(np.float32)
 
 
-def errors_less_common_turn(found, truth):
+def errors_less_common_rotation(found, truth):
     """Normal and turn errors in degrees after the common turn that fits best."""
     u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", truth, found))
     between = (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt) @ found @ truth.swapaxes(1, 2)
@@ -41,22 +47,22 @@ def errors_less_common_turn(found, truth):
     return np.rad2deg(normal), np.rad2deg(np.abs(turn))
 
 
-def test_turns_of_a_leaning_pile_are_found(scene, rng):
+def test_angles_of_a_leaning_pile_are_found(scene, rng):
     d = scene.dome_directions()
-    truth = frames_of_any_turn(rng, 100, 45.0)
+    truth = frames_of_any_angle(rng, 100, 45.0)
     samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.3)
     found = align(samples, d, d, refine=QUICK, n_threads=2)
     assert found.symmetries == ("none",)
-    normal, turn = errors_less_common_turn(found.local_from_base, truth)
+    normal, turn = errors_less_common_rotation(found.local_from_base, truth)
     # The harmonic search leaves several degrees; turns at random would be off by 90.
     assert np.median(normal) < 1.5
     assert np.median(turn) < 5.0
     assert found.margin.max() > 0.0
 
 
-def test_round_reflectance_keeps_the_turn_of_the_base_frame(scene, rng):
+def test_isotropic_reflectance_keeps_the_angle_of_the_base_frame(scene, rng):
     d = scene.dome_directions()
-    truth = frames_of_any_turn(rng, 60, 45.0)
+    truth = frames_of_any_angle(rng, 60, 45.0)
     samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.0)
     found = align(samples, d, d, refine=QUICK, n_threads=2)
     assert found.symmetries == ("all",)
@@ -69,8 +75,8 @@ def test_round_reflectance_keeps_the_turn_of_the_base_frame(scene, rng):
 def known_state(scene, rng):
     """Twenty upright texels of a leaning pile, each turned by a multiple of 15 degrees."""
     d = scene.dome_directions()
-    steps = rng.integers(0, N_TURNS, 20)
-    angle = 2 * np.pi * steps / N_TURNS
+    steps = rng.integers(0, N_ANGLES, 20)
+    angle = 2 * np.pi * steps / N_ANGLES
     truth = Rotation.from_rotvec(angle[:, None] * np.array([0.0, 0.0, 1.0])).as_matrix()
     samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.4)
     # The pile is linear in the directions, which bilinear nodes hold nearly exactly.
@@ -78,48 +84,44 @@ def known_state(scene, rng):
     nodes = HemisphereGrid(side).directions[None]
     values = leaning(np.where(nodes == 0, 1e-9, nodes), 0.4)
     start = np.tile(np.eye(3), (20, 1, 1))
-    data = SampleSet(samples, d, d)
-    cluster = np.zeros(20, np.int32)
-    return (
-        data,
-        Materials(NodeTargets(values, side, side), start, data.brightness(), cluster),
-        truth,
-    )
+    data, targets = SampleSet(samples, d, d), SplineTargets(values, side, side)
+    state = SharpAlignment.begin(data, start, np.zeros(20, np.int32), targets)
+    return data, state, truth
 
 
-def test_best_of_all_turns_is_the_true_one(known_state):
+def test_best_of_all_angles_is_the_true_one(known_state):
     data, state, truth = known_state
-    found = best_turns(data, state, 0.3, 1)
-    np.testing.assert_allclose(found.frames, truth, atol=1e-12)
-    misfit = turn_misfits(data, found, 0.3, 1)
-    assert misfit.shape == (20, N_TURNS)
-    assert np.all(np.argmin(misfit, axis=1) == 0)
+    best = at_best_angles(data, state, 0.3, 1)
+    np.testing.assert_allclose(best.frames, truth, atol=1e-12)
+    distance = distances_by_angle(data, best, 0.3, 1)
+    assert distance.shape == (20, N_ANGLES)
+    assert np.all(np.argmin(distance, axis=1) == 0)
 
 
-def test_margin_is_positive_at_the_best_turn_and_zero_elsewhere(known_state):
+def test_margin_is_positive_at_the_best_angle_and_zero_elsewhere(known_state):
     data, state, truth = known_state
-    right = Materials(state.targets, truth, state.brightness, state.cluster)
-    assert turn_margin(data, right, 0.3, False, 1).min() > 1e-3
+    right = replace(state, frames=truth)
+    assert angle_margin(data, right, 0.3, False, 1).min() > 1e-3
     away = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix() @ truth
-    wrong = Materials(state.targets, away, state.brightness, state.cluster)
-    assert np.array_equal(turn_margin(data, wrong, 0.3, False, 1), np.zeros(20))
+    wrong = replace(state, frames=away)
+    assert np.array_equal(angle_margin(data, wrong, 0.3, False, 1), np.zeros(20))
 
 
-def test_gauge_finds_the_normal_when_turns_follow_the_tilts(scene, rng):
+def test_normal_is_found_when_angles_follow_the_tilts(scene, rng):
     """Frames whose tilts all lean to the same local side: their mean is not upright."""
     d = scene.dome_directions()
     target = couple(Projector(d, d, (6, 6)).project(leaning(d[None], 0.2))).units()
     azimuth, tilt = rng.uniform(0, 2 * np.pi, 500), rng.uniform(0, np.pi / 3, 500)
     base_from_local = Rotation.from_euler("ZY", np.stack([azimuth, tilt], axis=1)).as_matrix()
-    assert turns_are_open(base_from_local, np.ones(500))
+    assert in_plane_undetermined(base_from_local, np.ones(500))
     cluster = np.zeros(500, np.int32)
-    gauged = fix_gauge(target, base_from_local, cluster, np.ones(500))
-    lean = np.arccos(np.sum(gauged.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
+    resolved = resolve_ambiguity(target, base_from_local, cluster, np.ones(500))
+    lean = np.arccos(np.sum(resolved.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
     # The pile leans the mean light by a few degrees, the mean frame by thirty.
     assert np.rad2deg(lean).max() < 8.0
 
 
-def test_gauge_takes_the_mean_normal_when_turns_are_random(scene, rng):
+def test_mean_normal_is_taken_when_angles_are_random(scene, rng):
     """The pile leans the mean light; random turns leave the mean normal its chance error."""
     d = scene.dome_directions()
     target = couple(Projector(d, d, (6, 6)).project(leaning(d[None], 0.2))).units()
@@ -127,8 +129,8 @@ def test_gauge_takes_the_mean_normal_when_turns_are_random(scene, rng):
     tilt = rng.uniform(0, np.pi / 3, 500)
     angles = np.stack([azimuth, tilt, turn], axis=1)
     base_from_local = Rotation.from_euler("ZYZ", angles).as_matrix()
-    gauged = fix_gauge(target, base_from_local, np.zeros(500, np.int32), np.ones(500))
-    lean = np.arccos(np.sum(gauged.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
+    resolved = resolve_ambiguity(target, base_from_local, np.zeros(500, np.int32), np.ones(500))
+    lean = np.arccos(np.sum(resolved.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
     chance = np.arctan(np.linalg.norm(base_from_local[:, 2, :2].mean(axis=0)))
     # Tilts are at most sixty degrees: the mean of the normals is longer than a half.
     np.testing.assert_array_less(lean, 2.0 * chance)

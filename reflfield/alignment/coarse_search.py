@@ -117,8 +117,8 @@ def orbit_representatives(n_orbits: int) -> NDArray[np.float64]:
 
 def _classes(n_degrees: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Coefficients sorted by class, and where each class starts."""
-    turns = Rotation.from_quat(HALF_TURNS[1:3], scalar_first=True).as_matrix()
-    flat = rotation_blocks(turns, n_degrees)
+    half_turns = Rotation.from_quat(HALF_TURNS[1:3], scalar_first=True).as_matrix()
+    flat = rotation_blocks(half_turns, n_degrees)
     offsets = block_offsets(n_degrees)
     labels = []
     for j in range(n_degrees):
@@ -177,7 +177,7 @@ def coarse_grid(
 
 
 def tilted_back(rotations: NDArray[np.float64], max_tilt: float) -> NDArray[np.float64]:
-    """Rotations turned about a horizontal axis until z is tilted by at most `max_tilt`.
+    """Rotations, rotated about a horizontal axis until z is tilted by at most `max_tilt`.
 
     Examples
     --------
@@ -215,23 +215,23 @@ def _highest_maxima(
     row: NDArray[np.floating],
     lowest: float,
     neighbours: NDArray[np.int32],
-    found: NDArray[np.int32],
+    peaks: NDArray[np.int32],
 ) -> None:
     """The highest local maxima of one row above `lowest`, best first; -1: fewer."""
-    n_peaks = found.shape[0]
-    found[:] = -1
+    n_peaks = peaks.shape[0]
+    peaks[:] = -1
     for g in range(row.shape[0]):
         v = row[g]
         if v < lowest:
             continue
-        last = found[n_peaks - 1]
+        last = peaks[n_peaks - 1]
         if (last >= 0 and v <= row[last]) or not _is_maximum(row, g, neighbours[g]):
             continue
         p = n_peaks - 1
-        while p > 0 and (found[p - 1] < 0 or row[found[p - 1]] < v):
-            found[p] = found[p - 1]
+        while p > 0 and (peaks[p - 1] < 0 or row[peaks[p - 1]] < v):
+            peaks[p] = peaks[p - 1]
             p -= 1
-        found[p] = g
+        peaks[p] = g
 
 
 @numba.njit(cache=True, nogil=True)
@@ -260,7 +260,7 @@ def _peaks(
     mean: NDArray[np.floating],
     allowed: NDArray[np.bool_],
     neighbours: NDArray[np.int32],
-    found: NDArray[np.int32],
+    peaks: NDArray[np.int32],
     heights: NDArray[np.float64],
 ) -> None:
     row = np.zeros(ORBIT * planes.shape[2], planes.dtype)
@@ -273,7 +273,7 @@ def _peaks(
                     row[g] = NEVER
         heights[i] = _largest(row)
         lowest = mean[i] + LOWEST_SHARE * (heights[i] - mean[i])
-        _highest_maxima(row, min(lowest, heights[i]), neighbours, found[i])
+        _highest_maxima(row, min(lowest, heights[i]), neighbours, peaks[i])
 
 
 def coarse_peaks(
@@ -307,8 +307,8 @@ def coarse_peaks(
     for c, block in enumerate(grid.blocks):
         if len(block):
             np.matmul(low[:, grid.starts[c] : grid.starts[c + 1]], block, out=planes[c])
-    found = np.full((len(series), n_peaks), -1, np.int32)
+    peaks = np.full((len(series), n_peaks), -1, np.int32)
     heights = np.zeros(len(series))
-    _peaks(planes, series[:, 0], grid.allowed, grid.neighbours, found, heights)
-    rotations = np.where(found[:, :, None, None] >= 0, grid.rotations[found], np.nan)
+    _peaks(planes, series[:, 0], grid.allowed, grid.neighbours, peaks, heights)
+    rotations = np.where(peaks[:, :, None, None] >= 0, grid.rotations[peaks], np.nan)
     return rotations, heights

@@ -1,10 +1,10 @@
-r"""What lies below a texel's base horizon: unseen, not dark.
+r"""EM imputation below the horizon: what lies there is unseen, not dark.
 
 Coefficients of samples are formed as if the functions were zero below the base
 horizon. A tilted texel is cut there although its reflectance goes on, which draws
-the correlation back towards the base frame: about a tenth of the tilt. So what is unseen
-is taken from the target, in turn with the rotations (expectation maximisation with the unseen
-part as the hidden data): with the expected function :math:`p = s\,\Delta(R)\,c` and U
+the correlation back towards the base frame by about a tenth of the tilt. So what is unseen
+is taken from the target, alternating with the rotations (expectation maximisation with the
+unseen part as the hidden data): with the expected function :math:`p = s\,\Delta(R)\,c` and U
 the operator from a function to the coefficients of its samples above the horizon,
 
 .. math:: a' = a + p - (U_v \otimes U_l)\, p, \qquad
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from reflfield.alignment.expectation_maximisation import (
     TargetFit,
-    climb_near,
+    ascend_near,
     mean_targets,
     mean_weights,
 )
@@ -31,12 +31,12 @@ from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.wigner import rotation_blocks
 
 BLOCK = 256
-# One step a round: the extension moves on meanwhile.
-CLIMBING_STEPS = 1
-# Texels whose frames turned less than this in one round are settled, radians.
-SETTLED = np.deg2rad(0.05)
-# Functions whose extension is held at once: 64 MB at a band limit of 8.
-SETTLED_TOGETHER = 4096
+# One step a round: the imputed part moves on meanwhile.
+ASCENT_STEPS = 1
+# Texels whose frames rotated less than this in one round have converged, radians.
+CONVERGED = np.deg2rad(0.05)
+# Functions whose imputed part is held at once: 64 MB at a band limit of 8.
+FUNCTIONS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +65,10 @@ class Horizon:
         view = self.view.astype(coupled.dtype)
         return couple(np.matmul(view, half.reshape(n, n_view, n_light)))
 
-    def extended(
+    def imputed(
         self, source: Coupled, target: Coupled, rotations: NDArray[np.float64]
     ) -> Coupled:
-        """Functions with their unseen part expected from one target.
+        """Functions with their unseen part imputed from one target.
 
         Parameters
         ----------
@@ -91,22 +91,22 @@ class Horizon:
         for a, b in zip(source.blocks, seen.blocks, strict=True):
             power += np.einsum("nij,nij->n", b, b)
             product += np.einsum("nij,nij->n", a, b)
-        # A negative brightness would extend the function by the target's opposite.
+        # A negative brightness would impute the target's opposite.
         scale = np.maximum(product, 0.0) / np.where(power > 0, power, 1.0)
         factors = scale.astype(source.dtype)[:, None, None]
         parts = zip(source.blocks, expected.blocks, seen.blocks, strict=True)
         return Coupled(source.band_limits, tuple(a + factors * (e - s) for a, e, s in parts))
 
 
-def settle(
+def impute_and_ascend(
     source: Coupled,
     targets: Coupled,
-    found: SearchResult,
+    matches: SearchResult,
     horizon: Horizon,
     rounds: int,
     options: SearchOptions,
 ) -> SearchResult:
-    """Rotations and scores of functions extended below the horizon; labels stay.
+    """Rotations and scores of functions imputed below the horizon; labels stay.
 
     Parameters
     ----------
@@ -114,11 +114,11 @@ def settle(
         n functions.
     targets : Coupled
         One per cluster.
-    found : SearchResult
+    matches : SearchResult
         Where to begin.
     horizon : Horizon
     rounds : int
-        Of extending and climbing at most; a function stops when its frame has settled.
+        Of imputation and ascent at most; a function stops when its frame has converged.
     options : SearchOptions
 
     Returns
@@ -126,44 +126,44 @@ def settle(
     SearchResult
         Margins as before.
     """
-    rotations, score = found.rotations.copy(), found.score.copy()
-    alive = np.flatnonzero(found.score > 0)
-    for first in range(0, len(alive), SETTLED_TOGETHER):
-        moving = alive[first : first + SETTLED_TOGETHER]
+    rotations, score = matches.rotations.copy(), matches.score.copy()
+    alive = np.flatnonzero(matches.score > 0)
+    for first in range(0, len(alive), FUNCTIONS_AT_ONCE):
+        moving = alive[first : first + FUNCTIONS_AT_ONCE]
         for _ in range(rounds):
             now = replace(
-                found,
+                matches,
                 rotations=rotations[moving],
                 score=score[moving],
-                cluster=found.cluster[moving],
+                cluster=matches.cluster[moving],
             )
-            extended = _extended(source[moving], targets, now, horizon, options)
-            moved = climb_near(extended, targets, now, CLIMBING_STEPS, options)
+            imputed = _imputed(source[moving], targets, now, horizon, options)
+            moved = ascend_near(imputed, targets, now, ASCENT_STEPS, options)
             rotations[moving], score[moving] = moved.rotations, moved.score
             chord = np.linalg.norm(moved.rotations - now.rotations, axis=(1, 2))
-            moving = moving[chord > np.sqrt(2.0) * SETTLED]
+            moving = moving[chord > np.sqrt(2.0) * CONVERGED]
             if len(moving) == 0:
                 break
-    return replace(found, rotations=rotations, score=score)
+    return replace(matches, rotations=rotations, score=score)
 
 
-def extend_targets(
+def impute_targets(
     source: Coupled,
     fit: TargetFit,
     horizon: Horizon,
     rounds: int,
     options: SearchOptions,
 ) -> TargetFit:
-    """Targets as means of the extended functions, in turn with the rotations.
+    """Targets as means of the imputed functions, alternating with the rotations.
 
     Parameters
     ----------
     source : Coupled
-        The functions that `fit` was found on.
+        The functions that `fit` was made from.
     fit : TargetFit
     horizon : Horizon
     rounds : int
-        At most; ends when the correlation of the extended functions falls.
+        At most; ends when the correlation of the imputed functions falls.
     options : SearchOptions
 
     Returns
@@ -172,36 +172,36 @@ def extend_targets(
     """
     weights = mean_weights(source.norms())
     history = list(fit.history)
-    targets, found = fit.targets, fit.found
+    targets, matches = fit.targets, fit.matches
     for _ in range(rounds):
-        extended = _extended(source, targets, found, horizon, options)
-        moved = climb_near(extended, targets, found, CLIMBING_STEPS, options)
+        imputed = _imputed(source, targets, matches, horizon, options)
+        moved = ascend_near(imputed, targets, matches, ASCENT_STEPS, options)
         score = float(weights @ moved.score / max(weights.sum(), 1e-300))
         if history and score < history[-1]:
             break
         history.append(score)
-        found = moved
-        targets = mean_targets(extended, weights, found, len(targets))
-    return TargetFit(targets, found, np.array(history))
+        matches = moved
+        targets = mean_targets(imputed, weights, matches, len(targets))
+    return TargetFit(targets, matches, np.array(history))
 
 
-def _extended(
+def _imputed(
     source: Coupled,
     targets: Coupled,
-    found: SearchResult,
+    matches: SearchResult,
     horizon: Horizon,
     options: SearchOptions,
 ) -> Coupled:
-    """Unit functions, each extended by its cluster's target."""
+    """Unit functions, each imputed from its cluster's target."""
 
     def block(rows: slice) -> Coupled:
-        part, label = source[rows], found.cluster[rows]
+        part, label = source[rows], matches.cluster[rows]
         blocks = tuple(b.copy() for b in part.blocks)
         for k in np.unique(label):
             mine = np.flatnonzero(label == k)
-            rotations = found.rotations[rows][mine]
-            extended = horizon.extended(part[mine], targets[k : k + 1], rotations).units()
-            for b, e in zip(blocks, extended.blocks, strict=True):
+            rotations = matches.rotations[rows][mine]
+            imputed = horizon.imputed(part[mine], targets[k : k + 1], rotations).units()
+            for b, e in zip(blocks, imputed.blocks, strict=True):
                 b[mine] = e
         return Coupled(source.band_limits, blocks)
 

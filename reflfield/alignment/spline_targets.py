@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -32,7 +33,7 @@ FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @dataclass(frozen=True, eq=False)
-class NodeTargets:
+class SplineTargets:
     """Sharp targets of all clusters by the coefficients of their splines.
 
     Parameters
@@ -47,10 +48,81 @@ class NodeTargets:
     view_side: int
     light_side: int
 
+    @classmethod
+    def zeros(cls, n_clusters: int, counts: tuple[int, ...], side: int) -> SplineTargets:
+        """Empty targets for samples of so many views and lights."""
+        view, light = (1 if count == 1 else side for count in counts)
+        return cls(np.zeros((n_clusters, view**2, light**2), np.float32), view, light)
+
     @property
     def sides(self) -> tuple[int, int]:
         """Of view and light."""
         return self.view_side, self.light_side
+
+    def of_cluster(self, k: int) -> SplineTargets:
+        """Target of one cluster."""
+        return self.replaced(self.values[k : k + 1])
+
+    def replaced(self, values: NDArray[np.float32]) -> SplineTargets:
+        """Other coefficients on the same nodes."""
+        return SplineTargets(values, self.view_side, self.light_side)
+
+
+class Texels(NamedTuple):
+    """Samples of some texels as the kernels take them.
+
+    Parameters
+    ----------
+    samples : (n, n_views, n_lights) float32
+        Not finite where unobserved.
+    views, lights : (1 or n, n_views, 3), (1 or n, n_lights, 3) float64
+    frames : (n, 3, 3) float64
+    brightness : (n,) float64
+        Texels with 0 take no part.
+    sides : (int, int)
+        Of the target's nodes.
+    floor : float
+        See `RefinementOptions`.
+    """
+
+    samples: NDArray[np.float32]
+    views: NDArray[np.float64]
+    lights: NDArray[np.float64]
+    frames: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    sides: tuple[int, int]
+    floor: float
+
+
+class Placement(NamedTuple):
+    """Where directions fall on the nodes of a square.
+
+    Parameters
+    ----------
+    side : int
+    first : (k,) int64
+        First node of each direction; -1 below the horizon.
+    taps : (k, 4, 4) float32
+        Weights and slopes along u, then along v.
+    slopes : (k, 6) float32
+        Derivatives of u, then of v, in nodes per radian of rotation about the three axes.
+    """
+
+    side: int
+    first: NDArray[np.int64]
+    taps: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+
+
+@numba.njit(cache=True, nogil=True)
+def empty_placement(n: int, side: int) -> Placement:
+    """Room for the placement of n directions."""
+    return Placement(
+        side,
+        np.zeros(n, np.int64),
+        np.zeros((n, 4, 4), np.float32),
+        np.zeros((n, 6), np.float32),
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -68,20 +140,9 @@ def _taps(position: float, weights: NDArray[np.float32], slopes: NDArray[np.floa
 
 
 @numba.njit(cache=True, nogil=True)
-def place(
-    directions: NDArray[np.float64],
-    frame: NDArray[np.float64],
-    side: int,
-    first: NDArray[np.int64],
-    taps: NDArray[np.float32],
-    turns: NDArray[np.float32],
-) -> None:
-    """Taps of directions in a frame, and how turning the frame's content moves them.
-
-    `first` (k,) receives the first node, -1 below the horizon; `taps` (k, 4, 4) weights and
-    slopes along u, then along v; `turns` (k, 6) the derivatives of u, then of v, in
-    nodes per radian about the three axes.
-    """
+def place(directions: NDArray[np.float64], frame: NDArray[np.float64], out: Placement) -> None:
+    """Place directions (k, 3) in a frame (active rotation of its content in `slopes`)."""
+    side, first, taps, slopes = out.side, out.first, out.taps, out.slopes
     scale = 0.5 * (side - 3)
     for i in range(directions.shape[0]):
         d0, d1, d2 = directions[i, 0], directions[i, 1], directions[i, 2]
@@ -90,7 +151,7 @@ def place(
         z = frame[2, 0] * d0 + frame[2, 1] * d1 + frame[2, 2] * d2
         if side == 1:
             first[i] = 0
-            turns[i] = 0.0
+            slopes[i] = 0.0
             taps[i] = 0.0
             taps[i, 0, 0] = taps[i, 2, 0] = 1.0
             continue
@@ -101,14 +162,21 @@ def place(
         column = _taps(1.0 + scale * (1.0 + x * shrink), taps[i, 0], taps[i, 1])
         row = _taps(1.0 + scale * (1.0 + y * shrink), taps[i, 2], taps[i, 3])
         first[i] = row * side + column
-        # Turning by w moves d by w x d; of 1 / sqrt(1 + z) the derivative is `bend`.
+        # A rotation by w moves d by w x d; of 1 / sqrt(1 + z) the derivative is `bend`.
         bend = -0.5 * shrink / (1.0 + z)
-        turns[i, 0] = scale * x * bend * y
-        turns[i, 1] = scale * (z * shrink - x * bend * x)
-        turns[i, 2] = -scale * y * shrink
-        turns[i, 3] = scale * (y * bend * y - z * shrink)
-        turns[i, 4] = -scale * y * bend * x
-        turns[i, 5] = scale * x * shrink
+        slopes[i, 0] = scale * x * bend * y
+        slopes[i, 1] = scale * (z * shrink - x * bend * x)
+        slopes[i, 2] = -scale * y * shrink
+        slopes[i, 3] = scale * (y * bend * y - z * shrink)
+        slopes[i, 4] = -scale * y * bend * x
+        slopes[i, 5] = scale * x * shrink
+
+
+@numba.njit(cache=True, nogil=True)
+def place_texel(texels: Texels, i: int, views: Placement, lights: Placement) -> None:
+    """Place the directions of one texel in its frame."""
+    place(texels.views[i % len(texels.views)], texels.frames[i], views)
+    place(texels.lights[i % len(texels.lights)], texels.frames[i], lights)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -170,70 +238,63 @@ def value_at(
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather_row(
-    row: NDArray[np.float32],
-    line: NDArray[np.float32],
-    scale: float,
-    floor: float,
-    with_samples: bool,
-    first: NDArray[np.int64],
-    taps: NDArray[np.float32],
-    side: int,
-    out: NDArray[np.float32],
-    touch: NDArray[np.float32],
-) -> None:
-    """Scatter one view's weighted residuals, and weights, to the light nodes."""
+def scatter_row(row: NDArray[np.float32], lights: Placement, out: NDArray[np.float32]) -> None:
+    """Adjoint of `value_at`: one view's values to the light nodes; NaN is left out."""
     out[:] = 0.0
-    touch[:] = 0.0
-    count = 4 if side > 1 else 1
+    count = 4 if lights.side > 1 else 1
     for k in range(row.shape[0]):
-        value = row[k]
-        if first[k] < 0 or not np.isfinite(value):
+        value, first = row[k], lights.first[k]
+        if first < 0 or np.isnan(value):
             continue
-        u, v = taps[k, 0], taps[k, 2]
-        rest = -scale * value_at(line, first[k], side, u, v)
-        weight = scale / (floor + abs(value))
-        if with_samples:
-            rest += value
-        push, power = np.float32(weight * rest), np.float32(weight * scale)
+        u, v = lights.taps[k, 0], lights.taps[k, 2]
         for a in range(count):
-            start = first[k] + a * side
-            part, hit = out[start : start + count], touch[start : start + count]
-            p, q = v[a] * push, v[a] * power
+            start, p = first + a * lights.side, v[a] * value
+            part = out[start : start + count]
             for b in range(count):
                 part[b] += p * u[b]
-            if with_samples:
-                for b in range(count):
-                    hit[b] += q * u[b]
 
 
 @numba.njit(cache=True, nogil=True)
-def _spread_view(
-    out: NDArray[np.float32],
-    first: int,
-    side: int,
-    taps: NDArray[np.float32],
-    sums: NDArray[np.float64],
+def scatter_view(
+    out: NDArray[np.float32], views: Placement, v: int, sums: NDArray[np.float64]
 ) -> None:
-    """Add values on the light nodes to the view nodes that made them."""
-    count = 4 if side > 1 else 1
+    """Add values on the light nodes to the nodes of one view."""
+    count, taps = 4 if views.side > 1 else 1, views.taps[v]
     for a in range(count):
         for b in range(count):
-            w, into = taps[2, a] * taps[0, b], sums[first + a * side + b]
+            w, into = taps[2, a] * taps[0, b], sums[views.first[v] + a * views.side + b]
             for k in range(out.shape[0]):
                 into[k] += w * out[k]
 
 
 @numba.njit(cache=True, nogil=True)
+def _weighted_residuals(
+    row: NDArray[np.float32],
+    line: NDArray[np.float32],
+    scale_and_floor: tuple[float, float],
+    with_samples: bool,
+    lights: Placement,
+    rows: NDArray[np.float32],
+) -> None:
+    """S w (y - s T c), and s s w, of one view's samples; NaN where unobserved."""
+    scale, floor = scale_and_floor
+    for k in range(row.shape[0]):
+        value, first = row[k], lights.first[k]
+        rows[0, k] = rows[1, k] = np.nan
+        if first < 0 or not np.isfinite(value):
+            continue
+        taps = lights.taps[k]
+        rest = -scale * value_at(line, first, lights.side, taps[0], taps[2])
+        weight = scale / (floor + abs(value))
+        if with_samples:
+            rest += value
+        rows[0, k], rows[1, k] = np.float32(weight * rest), np.float32(weight * scale)
+
+
+@numba.njit(cache=True, nogil=True)
 def back_project(
-    samples: NDArray[np.float32],
-    views: NDArray[np.float64],
-    lights: NDArray[np.float64],
-    frames: NDArray[np.float64],
-    brightness: NDArray[np.float64],
+    texels: Texels,
     values: NDArray[np.float32],
-    sides: tuple[int, int],
-    relative_floor: float,
     with_samples: bool,
     sums: NDArray[np.float64],
     touched: NDArray[np.float64],
@@ -242,58 +303,45 @@ def back_project(
 
     Without samples y counts as 0 where it is observed, and `touched` is left alone.
     """
-    n_views, n_lights = samples.shape[1:]
-    v_first, l_first = np.zeros(n_views, np.int64), np.zeros(n_lights, np.int64)
-    v_taps = np.zeros((n_views, 4, 4), np.float32)
-    l_taps = np.zeros((n_lights, 4, 4), np.float32)
-    v_turns = np.zeros((n_views, 6), np.float32)
-    l_turns = np.zeros((n_lights, 6), np.float32)
-    line = np.zeros(values.shape[1], np.float32)
-    out, touch = np.zeros_like(line), np.zeros_like(line)
-    for i in range(samples.shape[0]):
-        if brightness[i] <= 0.0:
+    n_views, n_lights = texels.samples.shape[1:]
+    views = empty_placement(n_views, texels.sides[0])
+    lights = empty_placement(n_lights, texels.sides[1])
+    line, out = np.zeros(values.shape[1], np.float32), np.zeros(values.shape[1], np.float32)
+    rows = np.zeros((2, n_lights), np.float32)
+    for i in range(texels.samples.shape[0]):
+        scale = texels.brightness[i]
+        if scale <= 0.0:
             continue
-        place(views[i % len(views)], frames[i], sides[0], v_first, v_taps, v_turns)
-        place(lights[i % len(lights)], frames[i], sides[1], l_first, l_taps, l_turns)
-        floor = relative_floor * brightness[i]
+        place_texel(texels, i, views, lights)
+        levels = (scale, texels.floor * scale)
         for v in range(n_views):
-            if v_first[v] < 0:
+            if views.first[v] < 0:
                 continue
-            blend_value(values, v_first[v], sides[0], v_taps[v], line)
-            _gather_row(
-                samples[i, v],
-                line,
-                brightness[i],
-                floor,
-                with_samples,
-                l_first,
-                l_taps,
-                sides[1],
-                out,
-                touch,
-            )
-            _spread_view(out, v_first[v], sides[0], v_taps[v], sums)
+            blend_value(values, views.first[v], views.side, views.taps[v], line)
+            _weighted_residuals(texels.samples[i, v], line, levels, with_samples, lights, rows)
+            scatter_row(rows[0], lights, out)
+            scatter_view(out, views, v, sums)
             if with_samples:
-                _spread_view(touch, v_first[v], sides[0], v_taps[v], touched)
+                scatter_row(rows[1], lights, out)
+                scatter_view(out, views, v, touched)
 
 
 @numba.njit(cache=True, nogil=True)
 def expect(
     values: NDArray[np.float32],
-    sides: tuple[int, int],
-    first: tuple[NDArray[np.int64], NDArray[np.int64]],
-    taps: tuple[NDArray[np.float32], NDArray[np.float32]],
+    views: Placement,
+    lights: Placement,
     line: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Target at all pairs of directions of one texel, from `place`; NaN below a horizon."""
+    """Target at all pairs of directions of one texel; NaN below a horizon."""
     for v in range(out.shape[0]):
-        if first[0][v] < 0:
+        if views.first[v] < 0:
             out[v] = np.nan
             continue
-        blend_value(values, first[0][v], sides[0], taps[0][v], line)
+        blend_value(values, views.first[v], views.side, views.taps[v], line)
         for k in range(out.shape[1]):
-            start = first[1][k]
+            first, taps = lights.first[k], lights.taps[k]
             out[v, k] = np.nan
-            if start >= 0:
-                out[v, k] = value_at(line, start, sides[1], taps[1][k, 0], taps[1][k, 2])
+            if first >= 0:
+                out[v, k] = value_at(line, first, lights.side, taps[0], taps[2])
