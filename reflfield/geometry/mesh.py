@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -15,7 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.open3d_library import open3d
 from reflfield.util.files import replacing
+from reflfield.util.late_import import LateImport
 from reflfield.util.validation import check_shape
+
+trimesh: Any = LateImport("trimesh")
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int32]

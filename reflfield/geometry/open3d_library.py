@@ -1,14 +1,16 @@
-"""Open3D, loaded so that it imports on a machine without libusb.
+"""Open3D, imported when it is first used, also on a machine without libusb.
 
 Open3D 0.20, the first with wheels for Python 3.13, links against libusb-1.0 for depth cameras
 that nothing here uses. The wheel `libusb-package` ships that library; loaded first, with its
-symbols global, it satisfies the import.
+symbols global, it satisfies the import. The import takes seconds, so it waits until rays are
+traced.
 """
 
 from __future__ import annotations
 
 import ctypes
 import sys
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -18,6 +20,7 @@ from reflfield.errors import ReflfieldError
 LIBUSB = "libusb-1.0.so.0"
 
 
+@cache
 def load_open3d() -> Any:
     """Import Open3D, after libusb where that is needed.
 
@@ -53,4 +56,11 @@ def _load_libusb() -> None:
                 ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
-open3d = load_open3d()
+class _ImportedWhenUsed:
+    """Stands for the module `open3d`."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(load_open3d(), name)
+
+
+open3d: Any = _ImportedWhenUsed()
