@@ -92,20 +92,20 @@ def contributions(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> list[Co
     """
     arriving(scene, tracer, pairs)  # what is compiled or found once for all is no part of it
     everything, seconds = arriving(scene, tracer, pairs)
-    found = []
+    changes = []
     for effect in EFFECTS:
         if not _described(scene, effect) or effect is dropped_photographs:
             continue
         if effect.STAGE is Stage.SENSOR:
-            found.append(_of_sensor(scene, effect, everything))
+            changes.append(_of_sensor(scene, effect, everything))
             continue
         other, others_seconds = arriving(toggled(scene, effect), tracer, pairs)
         added = (seconds - others_seconds) / len(pairs)
         if simulated(scene, effect):
-            found.append(_compared(effect, everything, other, added))
+            changes.append(_compared(effect, everything, other, added))
         else:
-            found.append(_compared(effect, other, everything, -added))
-    return found
+            changes.append(_compared(effect, other, everything, -added))
+    return changes
 
 
 def _described(scene: Scene, effect: Effect) -> bool:

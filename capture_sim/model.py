@@ -69,8 +69,8 @@ class EffectOptions:
 
     def get(self, kind: type[Options]) -> Options:
         """Options of one effect, its defaults where the scene has no table."""
-        found = self.declared(kind)
-        return kind() if found is None else found
+        options = self.declared(kind)
+        return kind() if options is None else options
 
 
 @dataclass(frozen=True)

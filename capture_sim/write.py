@@ -170,8 +170,8 @@ def _write_views(
     for name in ("photographs", "silhouettes"):
         (folder / name).mkdir(exist_ok=True)
     scene = setup.real
-    wanted = setup.rig.taken & _missing(scene, folder)
-    total = int(setup.rig.taken.sum())
+    wanted = setup.rig.photographed & _missing(scene, folder)
+    total = int(setup.rig.photographed.sum())
     tally = _Tally(total - int(wanted.sum()), total, progress)
     for lights in _groups(scene):
         traced = traced_lights(scene, tracer, lights) if wanted[:, lights].any() else None
@@ -314,11 +314,11 @@ def capture_description(setup: Setup) -> dict[str, Any]:
 
 def _photograph_list(setup: Setup) -> dict[str, str] | list[dict[str, Any]]:
     bracketed = simulated(setup.scene, exposure_brackets)
-    if setup.rig.taken.all() and not bracketed:
+    if setup.rig.photographed.all() and not bracketed:
         return {"pattern": _photograph("{camera}", "{light}")}
     return [
         _listed(setup.scene, setup.scene.cameras[view], setup.scene.lights[light], bracketed)
-        for view, light in np.argwhere(setup.rig.taken).tolist()
+        for view, light in np.argwhere(setup.rig.photographed).tolist()
     ]
 
 

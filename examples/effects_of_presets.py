@@ -69,7 +69,7 @@ def column(scene: Scene, n_photographs: int) -> tuple[dict[str, str], list[str]]
         milliseconds = f" ({max(0.0, 1e3 * one.seconds):.0f})"
         cells[effect.NAME] = f"**{change}**{milliseconds}" if is_on else change
     if known.effects.declared(dropped_photographs.Options):
-        taken = set_up(known).rig.taken
+        taken = set_up(known).rig.photographed
         missing = f"{int((~taken).sum())} of {taken.size} missing"
         cells[dropped_photographs.NAME] = f"**{missing}**" if not taken.all() else missing
     return cells, wrong

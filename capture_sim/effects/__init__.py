@@ -167,7 +167,7 @@ class Rig:
         As they are: photographs are rendered with these.
     reported_cameras, reported_lights : tuple of dict
         Calibration that is written into the capture.
-    taken : (n_views, n_lights) bool
+    photographed : (n_views, n_lights) bool
         True for photographs that exist.
     """
 
@@ -175,7 +175,7 @@ class Rig:
     lights: tuple[Table, ...]
     reported_cameras: tuple[Table, ...]
     reported_lights: tuple[Table, ...]
-    taken: NDArray[np.bool_]
+    photographed: NDArray[np.bool_]
 
 
 def effect_rng(scene: Scene, effect: str, *indices: int) -> np.random.Generator:

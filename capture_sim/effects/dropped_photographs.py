@@ -78,9 +78,9 @@ def apply(rig: Rig, scene: Scene) -> Rig:
         If none is left.
     """
     options = scene.effects.get(Options)
-    taken = rig.taken & ~_lost(scene, options)
-    if not taken.any():
+    photographed = rig.photographed & ~_lost(scene, options)
+    if not photographed.any():
         raise scene_error(
             f"effects.{NAME}.fraction", "some photographs left", options.fraction, "lower it"
         )
-    return replace(rig, taken=taken)
+    return replace(rig, photographed=photographed)

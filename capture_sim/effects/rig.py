@@ -46,7 +46,7 @@ def real_rig(scene: Scene) -> Rig:
         lights=scene.lights,
         reported_cameras=scene.cameras,
         reported_lights=scene.lights,
-        taken=np.ones((len(scene.cameras), len(scene.lights)), dtype=bool),
+        photographed=np.ones((len(scene.cameras), len(scene.lights)), dtype=bool),
     )
     for effect in RIG_EFFECTS:
         if simulated(scene, effect):

@@ -321,11 +321,11 @@ def _exchange(
     scale = (len(table) - 1) / reach
     rows = 8  # nodes that take their part of a flux while it is in the cache
     total = np.zeros((rows, flux.shape[1]), dtype=flux.dtype)
-    taken = np.zeros(rows)
+    exchanged = np.zeros(rows)
     for first in range(0, len(cell), rows):
         block = cell[first : first + rows]
         total[:] = 0.0
-        taken[:] = 0.0
+        exchanged[:] = 0.0
         for m in others:
             for r in range(len(block)):
                 distance = _distance(positions[m], positions[block[r]])
@@ -333,13 +333,13 @@ def _exchange(
                     continue
                 value = _from_table(table, distance * scale) * area[m]
                 if distance < near:
-                    taken[r] += value
+                    exchanged[r] += value
                 weight = np.float32(value)
                 for k in range(total.shape[1]):
                     total[r, k] += weight * flux[m, k]
         for r in range(len(block)):
             # Near the node the profile's integral stands for its sum.
-            _finish(total[r], np.float32(inside - taken[r]), flux[block[r]], body[block[r]])
+            _finish(total[r], np.float32(inside - exchanged[r]), flux[block[r]], body[block[r]])
 
 
 @_compiled

@@ -40,10 +40,10 @@ def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
     path = reader.file("file", folder)
     parts = read_mesh(path)
     check_size(path.name, len(parts[1]))
-    found = repaired(*parts)
-    if len(found.faces) == 0:
+    triangles = repaired(*parts)
+    if len(triangles.faces) == 0:
         raise scene_error(reader.name("file"), "triangles with an area", f"none in {path}")
-    vertices = found.vertices
+    vertices = triangles.vertices
     rotation = Rotation.from_euler(
         "xyz", reader.vector("rotation_deg", (0, 0, 0), low=-1e6, high=1e6), degrees=True
     )
@@ -57,8 +57,8 @@ def mesh_from_file(reader: TableReader, folder: Path) -> SurfaceMesh:
         "position", (0, 0, 0), low=-1e9, high=1e9
     )
     smooth = reader.flag("smooth", True)
-    mesh = finish_mesh(vertices, found.faces, found.uv, path.name, smooth=smooth)
-    return replace(mesh, notes=tuple(f"{path.name}: {note}" for note in found.notes))
+    mesh = finish_mesh(vertices, triangles.faces, triangles.uv, path.name, smooth=smooth)
+    return replace(mesh, notes=tuple(f"{path.name}: {note}" for note in triangles.notes))
 
 
 def read_mesh(path: Path) -> tuple[Array, Faces, Array | None]:
@@ -132,8 +132,8 @@ def _check_counts(content: bytes, kind: str, mesh: tuple[int, int], path: Path) 
         lines = [re.search(rb"element[ \t]+%s[ \t]+(\d{1,18})" % n, header) for n in _ELEMENTS]
         promised = tuple(0 if line is None else int(line[1]) for line in lines)
     else:
-        found = re.match(rb"\s*[A-Z]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})", content)
-        promised = (0, 0) if found is None else (int(found[1]), int(found[2]))
+        counts = re.match(rb"\s*[A-Z]*OFF\s+(?:#.*\s+)*(\d{1,18})\s+(\d{1,18})", content)
+        promised = (0, 0) if counts is None else (int(counts[1]), int(counts[2]))
     for name, wanted, count in zip(_ELEMENTS, promised, mesh, strict=True):
         if wanted > count:
             raise scene_error(

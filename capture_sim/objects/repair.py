@@ -99,41 +99,43 @@ def _counted(count: int, what: str, done: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'} {done}"
 
 
-def _without_empty_faces(given: Triangles) -> Triangles:
-    corners = given.vertices[given.faces]
+def _without_empty_faces(triangles: Triangles) -> Triangles:
+    corners = triangles.vertices[triangles.faces]
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    size = np.ptp(given.vertices, axis=0).max()
+    size = np.ptp(triangles.vertices, axis=0).max()
     kept = doubled > NO_HEIGHT * size * longest
     notes = []
     if not kept.all():
         notes.append(_counted(int((~kept).sum()), "triangle", "without area dropped"))
     first = np.zeros(len(kept), dtype=bool)
-    same = np.sort(places(given.vertices)[given.faces], axis=1)
+    same = np.sort(places(triangles.vertices)[triangles.faces], axis=1)
     first[np.unique(np.where(kept[:, None], same, -1), axis=0, return_index=True)[1]] = True
     if twice := int((kept & ~first).sum()):
         notes.append(_counted(twice, "triangle", "that occur twice dropped"))
-    faces = given.faces[kept & first]
-    return replace(given, faces=faces, notes=(*given.notes, *notes))
+    faces = triangles.faces[kept & first]
+    return replace(triangles, faces=faces, notes=(*triangles.notes, *notes))
 
 
-def _turned_alike(given: Triangles) -> Triangles:
+def _turned_alike(triangles: Triangles) -> Triangles:
     """Neighbours wind alike, and closed parts face outwards."""
-    if len(given.faces) == 0:
-        return given
-    place = places(given.vertices)
+    if len(triangles.faces) == 0:
+        return triangles
+    place = places(triangles.vertices)
     _, one = np.unique(place, return_index=True)
-    mesh = trimesh.Trimesh(given.vertices[one], place[given.faces], process=False)
+    mesh = trimesh.Trimesh(triangles.vertices[one], place[triangles.faces], process=False)
     trimesh.repair.fix_winding(mesh)
     inwards = _facing_inwards(mesh)
     wanted = np.where(inwards[:, None], mesh.faces[:, ::-1], mesh.faces)
-    turned = ~_same_turn(place[given.faces], wanted)
-    faces = np.where(turned[:, None], given.faces[:, ::-1], given.faces).astype(np.int32)
+    turned = ~_same_turn(place[triangles.faces], wanted)
+    faces = np.where(turned[:, None], triangles.faces[:, ::-1], triangles.faces).astype(
+        np.int32
+    )
     if not turned.any():
-        return given
+        return triangles
     note = _counted(int(turned.sum()), "triangle", "turned to face outwards")
-    return replace(given, faces=faces, notes=(*given.notes, note))
+    return replace(triangles, faces=faces, notes=(*triangles.notes, note))
 
 
 def _same_turn(first: NDArray[np.integer], second: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -175,14 +177,14 @@ def open_edges(vertices: Array, faces: Faces) -> NDArray[np.int32]:
     return np.asarray(edges[count[group.ravel()] == 1])
 
 
-def _with_small_holes_closed(given: Triangles) -> Triangles:
-    if len(given.faces) == 0:
-        return given
-    edges = open_edges(given.vertices, given.faces)
-    limit = SMALL_HOLE * np.ptp(given.vertices, axis=0).max()
+def _with_small_holes_closed(triangles: Triangles) -> Triangles:
+    if len(triangles.faces) == 0:
+        return triangles
+    edges = open_edges(triangles.vertices, triangles.faces)
+    limit = SMALL_HOLE * np.ptp(triangles.vertices, axis=0).max()
     rims, wide = [], 0
-    for rim in _rims(places(given.vertices), edges):
-        corners = given.vertices[rim].reshape(-1, 3)
+    for rim in _rims(places(triangles.vertices), edges):
+        corners = triangles.vertices[rim].reshape(-1, 3)
         if np.ptp(corners, axis=0).max() <= limit:
             rims.append(rim)
         else:
@@ -190,7 +192,7 @@ def _with_small_holes_closed(given: Triangles) -> Triangles:
     notes = [_counted(len(rims), "small hole", "closed")] if rims else []
     if wide:
         notes.append(_counted(wide, "wide opening", "left open: taken as meant"))
-    closed = replace(given, notes=(*given.notes, *notes))
+    closed = replace(triangles, notes=(*triangles.notes, *notes))
     for rim in rims:
         closed = _closed(closed, rim)
     return closed
@@ -207,17 +209,17 @@ def _rims(place: NDArray[np.intp], edges: NDArray[np.int32]) -> list[NDArray[np.
     return [edges[part == which] for which in np.unique(part)]
 
 
-def _closed(given: Triangles, rim: NDArray[np.int32]) -> Triangles:
+def _closed(triangles: Triangles, rim: NDArray[np.int32]) -> Triangles:
     """Close a hole by a fan about the middle of its rim."""
-    middle = len(given.vertices)
-    centre = given.vertices[rim[:, 0]].mean(axis=0, keepdims=True)
+    middle = len(triangles.vertices)
+    centre = triangles.vertices[rim[:, 0]].mean(axis=0, keepdims=True)
     fan = np.stack([rim[:, 1], rim[:, 0], np.full(len(rim), middle)], axis=1)
-    uv = given.uv
+    uv = triangles.uv
     if uv is not None:
         uv = np.vstack([uv, uv[rim[:, 0]].mean(axis=0, keepdims=True)])
     return replace(
-        given,
-        vertices=np.vstack([given.vertices, centre]),
-        faces=np.vstack([given.faces, fan]).astype(np.int32),
+        triangles,
+        vertices=np.vstack([triangles.vertices, centre]),
+        faces=np.vstack([triangles.faces, fan]).astype(np.int32),
         uv=uv,
     )

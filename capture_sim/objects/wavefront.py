@@ -142,11 +142,11 @@ def _face(corners: list[str], counts: dict[str, int], last: dict[str, int]) -> s
         parts = corner.split("/")
         if len(parts) > 3 or not parts[0]:
             raise ValueError("corners v, v/vt, v//vn or v/vt/vn after 'f'")
-        found = [
+        indices = [
             str(_index(part, kind, counts, last)) if part else ""
             for part, kind in zip(parts, ("v", "vt", "vn"), strict=False)
         ]
-        absolute.append("/".join(found).rstrip("/"))
+        absolute.append("/".join(indices).rstrip("/"))
     return " ".join(["f", *absolute])
 
 

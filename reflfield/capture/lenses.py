@@ -44,10 +44,11 @@ def distort(ideal: Array, distortion: Coefficients) -> Array:
     >>> distort(np.array([[1.0, 0.0]]), (-0.1, 0, 0, 0, 0, 0))
     array([[0.9, 0. ]])
     """
-    k1, k2, p1, p2, k3, k4, k5, k6 = padded(distortion)
+    _, _, p1, p2, *_ = padded(distortion)
+    numerator, denominator = _radial_polynomials(distortion)
     x, y = ideal.T
     r2 = x * x + y * y
-    gain = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    gain = numerator(r2) / denominator(r2)
     return np.stack(
         [
             x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -106,8 +107,7 @@ def largest_radius(distortion: Coefficients) -> float:
     >>> largest_radius((-1 / 3, 0, 0, 0, 0, 0))
     1.0
     """
-    k1, k2, _, _, k3, k4, k5, k6 = padded(distortion)
-    numerator, denominator = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+    numerator, denominator = _radial_polynomials(distortion)
     square = Polynomial([0.0, 1.0])
     slope = (numerator + 2 * square * numerator.deriv()) * denominator
     slope = slope - 2 * square * numerator * denominator.deriv()
@@ -188,6 +188,12 @@ def padded(distortion: Coefficients) -> Coefficients:
     return (*distortion, *(0.0,) * (len(NAMES) - len(distortion)))
 
 
+def _radial_polynomials(distortion: Coefficients) -> tuple[Polynomial, Polynomial]:
+    """Numerator and denominator of the gain `g`, as polynomials of r^2."""
+    k1, k2, _, _, k3, k4, k5, k6 = padded(distortion)
+    return Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+
+
 def _fisheye_coefficients(distortion: Coefficients) -> Array:
     k1, k2, _, _, k3, k4, _, _ = padded(distortion)
     return np.array([k1, k2, k3, k4])
@@ -206,14 +212,13 @@ def _radii(image: Array) -> Array:
 
 def _jacobian(ideal: Array, distortion: Coefficients) -> Array:
     """(n, 2, 2) derivatives of `distort`."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = padded(distortion)
+    _, _, p1, p2, *_ = padded(distortion)
+    numerator, denominator = _radial_polynomials(distortion)
     x, y = ideal.T
     r2 = x * x + y * y
-    top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    gain = top / bottom
-    rise = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    slope = (rise - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / bottom  # d gain / d r^2
+    gain = numerator(r2) / denominator(r2)
+    # d gain / d r^2
+    slope = (numerator.deriv()(r2) - gain * denominator.deriv()(r2)) / denominator(r2)
     cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     jacobian = np.zeros((len(ideal), 2, 2))
     jacobian[:, 0, 0] = gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x

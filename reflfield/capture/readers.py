@@ -91,10 +91,10 @@ def open_capture(
             f"{path}: expected a capture's folder or description; does not exist"
         )
     if path.is_dir():
-        description, found = _description_in(path, format)
+        description, kind = _description_in(path, format)
     else:
-        description, found = path, format or _kind_of_file(path)
-    capture = _read(description, found, follow_links=follow_links, test_split=test_split)
+        description, kind = path, format or _kind_of_file(path)
+    capture = _read(description, kind, follow_links=follow_links, test_split=test_split)
     capture = capture.read_as(reading)
     check_environments(capture)
     if require_photographs:
@@ -127,7 +127,7 @@ def _read(description: Path, format: str, *, follow_links: bool, test_split: boo
 
 def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
     """The one description in a folder and its format."""
-    found = [
+    descriptions = [
         (file, name)
         for name, reader in READERS.items()
         if format in (None, name)
@@ -135,17 +135,17 @@ def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
         if not file.is_dir()
     ]
     train = folder / transforms_json.TRAIN_NAME
-    if not found and format in (None, "transforms") and train.is_file():
+    if not descriptions and format in (None, "transforms") and train.is_file():
         return train, "transforms"
-    if len(found) == 1:
-        return found[0]
+    if len(descriptions) == 1:
+        return descriptions[0]
     for name in (native.FILE_NAME, transforms_json.FILE_NAME):
         other = folder / name
-        if not found and (other.is_dir() or other.is_symlink()):
+        if not descriptions and (other.is_dir() or other.is_symlink()):
             check_regular(other, CaptureError)  # says what it is
     wanted = ", ".join(r.pattern for name, r in READERS.items() if format in (None, name))
-    received = ", ".join(file.name for file, _ in found) or "none of them"
-    remedy = "name the file itself" if found else "is this the capture's own folder?"
+    received = ", ".join(file.name for file, _ in descriptions) or "none of them"
+    remedy = "name the file itself" if descriptions else "is this the capture's own folder?"
     raise CaptureError(f"{folder}: expected one of {wanted}, received {received}; {remedy}")
 
 

@@ -31,11 +31,11 @@ def object_bounds(views: Sequence[View], tolerance: int) -> tuple[Array, Array]:
     origin, scale = _whereabouts(views)
     n_groups = tolerance + 1
     boxes = [_box(views[group::n_groups], origin, scale) for group in range(n_groups)]
-    found = [box for box in boxes if box is not None]
-    if not found:
+    known = [box for box in boxes if box is not None]
+    if not known:
         _refuse_contradiction(views, origin, scale)
-    low = np.min([box[0] for box in found], axis=0)
-    high = np.max([box[1] for box in found], axis=0)
+    low = np.min([box[0] for box in known], axis=0)
+    high = np.max([box[1] for box in known], axis=0)
     return origin + scale * low, origin + scale * high
 
 

@@ -125,13 +125,13 @@ class FrameErrors:
 
     def summary(self) -> dict[str, float]:
         """Mean, median and 95th percentile of both angles, degrees, and the count."""
-        found: dict[str, float] = {"n_texels": float(len(self.texel))}
+        statistics: dict[str, float] = {"n_texels": float(len(self.texel))}
         for name, angles in (("normal", self.normal), ("tangent", self.tangent)):
             known = angles if angles.size else np.array([math.nan])
-            found[f"{name}_mean_deg"] = float(np.mean(known))
-            found[f"{name}_median_deg"] = float(np.median(known))
-            found[f"{name}_p95_deg"] = float(np.percentile(known, 95))
-        return found
+            statistics[f"{name}_mean_deg"] = float(np.mean(known))
+            statistics[f"{name}_median_deg"] = float(np.median(known))
+            statistics[f"{name}_p95_deg"] = float(np.percentile(known, 95))
+        return statistics
 
 
 def frame_errors(
@@ -191,7 +191,7 @@ def frame_errors(
     tree = cKDTree(surface.position)
     distance, nearest = tree.query(texels)
     usable = (distance <= max_distance) & np.isfinite(frames).all(axis=(1, 2))
-    matched, found = np.flatnonzero(usable), frames[usable]
+    matched, own_frames = np.flatnonzero(usable), frames[usable]
     true = [(np.zeros((0, 3)), np.zeros((0, 3)))]
     for first in range(0, len(matched), TEXELS_PER_BLOCK):
         block = matched[first : first + TEXELS_PER_BLOCK]
@@ -199,14 +199,16 @@ def frame_errors(
     normal, tangent = (np.concatenate(part) for part in zip(*true, strict=True))
     label = surface.label[nearest[matched]]
     turns: tuple[FreeTurn, ...] = ()
-    own_tangent = found[:, 0]
+    own_tangent = own_frames[:, 0]
     if targets is not None:
         target = np.asarray(targets)
         check_shape("targets", target, (len(texels),))
-        turns, own_tangent = _without_free_turns(found, normal, tangent, target[matched], label)
+        turns, own_tangent = _without_free_turns(
+            own_frames, normal, tangent, target[matched], label
+        )
     return FrameErrors(
         matched,
-        angle_deg(found[:, 2], normal),
+        angle_deg(own_frames[:, 2], normal),
         _line_angle_deg(own_tangent, tangent),
         label,
         turns,

@@ -46,10 +46,12 @@ class HullDistance:
             "p95": np.percentile(size, 95),
             "max": size.max(),
         }
-        found = {f"{name}_mm": float(v * 1e3) for name, v in in_metres.items()}
+        summary = {f"{name}_mm": float(v * 1e3) for name, v in in_metres.items()}
         if self.voxel is not None:
-            found |= {f"{name}_voxels": float(v / self.voxel) for name, v in in_metres.items()}
-        return found | {"outside_share": self.outside, "inside_share": 1.0 - self.outside}
+            summary |= {
+                f"{name}_voxels": float(v / self.voxel) for name, v in in_metres.items()
+            }
+        return summary | {"outside_share": self.outside, "inside_share": 1.0 - self.outside}
 
 
 def hull_distance(
@@ -147,9 +149,9 @@ def _signed_distances(points: Array, vertices: Array, faces: NDArray[np.int64]) 
         open3d.core.Tensor(faces.astype(np.uint32)),
     )
     query = open3d.core.Tensor(((points - centre) / size).astype(np.float32))
-    found = scene.compute_closest_points(query)
-    face = found["primitive_ids"].numpy().astype(np.int64)
-    uv = found["primitive_uvs"].numpy().astype(np.float64)
+    closest = scene.compute_closest_points(query)
+    face = closest["primitive_ids"].numpy().astype(np.int64)
+    uv = closest["primitive_uvs"].numpy().astype(np.float64)
     weights = np.stack([1.0 - uv.sum(axis=1), uv[:, 0], uv[:, 1]], axis=1)
     nearest = np.einsum("nk,nkd->nd", weights, vertices[faces[face]])
     normal = np.einsum("nk,nkd->nd", weights, _vertex_normals(vertices, faces)[faces[face]])

@@ -99,12 +99,12 @@ def _radiances(
 
     Values that were not measured are NaN.
     """
-    found = reader.measured(texels)
-    t, i, j = np.nonzero(found.seen)
+    measured = reader.measured(texels)
+    t, i, j = np.nonzero(measured.seen)
     irradiance = facing_irradiance(reader.capture.lights, reader.positions[texels])
     return (
-        found.samples[t, i, j].astype(np.float32) * np.float32(found.unit),
-        evaluate(field, texels[t], found.views[t, i], found.lights[t, j]),
+        measured.samples[t, i, j].astype(np.float32) * np.float32(measured.unit),
+        evaluate(field, texels[t], measured.views[t, i], measured.lights[t, j]),
         irradiance[t, j],
     )
 

@@ -282,11 +282,11 @@ def _both(left: Floats, right: Floats, values: Floats, out: Floats) -> None:
         for j in range(d):
             for channel in range(n_channels):
                 folded[i, channel, j] = halfway[i, j, channel]
-    found = (folded.reshape(n_channels * a, d) @ right.T).reshape(a, n_channels, c)
+    resampled = (folded.reshape(n_channels * a, d) @ right.T).reshape(a, n_channels, c)
     for i in range(a):
         for channel in range(n_channels):
             for j in range(c):
-                out[i, j, channel] = found[i, channel, j]
+                out[i, j, channel] = resampled[i, channel, j]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -267,10 +267,10 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
-    found = Projected(n_photographs, np.concatenate(values), bits, brightest, first)
-    n_gaps = sum(found.count(kind) for kind in NOT_MEASURED)
-    note_gaps(projection.location, n_gaps / max(int(found.values.sum()), 1))
-    return found
+    projected = Projected(n_photographs, np.concatenate(values), bits, brightest, first)
+    n_gaps = sum(projected.count(kind) for kind in NOT_MEASURED)
+    note_gaps(projection.location, n_gaps / max(int(projected.values.sum()), 1))
+    return projected
 
 
 def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any]]:
@@ -320,7 +320,7 @@ def look_into(projection: Projection) -> LookedInto:
     """Samples of a few photographs, spread evenly over the capture, at texels spread so."""
     capture, n = projection.capture, len(projection.capture.photographs)
     chosen = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
-    found = []
+    columns = []
     for index in chosen:
         photograph = capture.photographs[index]
         seen = np.flatnonzero(projection.visible[:, photograph.camera])
@@ -329,8 +329,8 @@ def look_into(projection: Projection) -> LookedInto:
         pixels, _ = capture.cameras[photograph.camera].project(points)
         lights = np.array([photograph.light])
         values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
-        found.append((np.full(len(some), index), some, values[:, 0], kinds[:, 0] == 0))
-    return LookedInto(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        columns.append((np.full(len(some), index), some, values[:, 0], kinds[:, 0] == 0))
+    return LookedInto(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
 def sample_unit(looked_into: LookedInto) -> float:

@@ -114,8 +114,8 @@ def other_light_axes(looks: list[Look]) -> str:
 
 def agreement(looks: list[Look], reading: Reading) -> float | None:
     """Mean correlation of brightness and cosine to the light; None where nothing tells."""
-    found = [_correlation(look, reading) for look in looks]
-    known = [value for value in found if value is not None]
+    correlations = [_correlation(look, reading) for look in looks]
+    known = [value for value in correlations if value is not None]
     return float(np.mean(known)) if known else None
 
 

@@ -206,20 +206,20 @@ def checked_read(
     """
     try:
         # One chunk after the other for indices, whole chunks for slices.
-        found = array[rows] if isinstance(rows, slice) else array.oindex[np.asarray(rows)]
+        samples = array[rows] if isinstance(rows, slice) else array.oindex[np.asarray(rows)]
     except ValueError as error:
         raise InputError(
             f"{location}: expected chunks that agree with their checksums, found one that "
             f"does not ({error}); compute the stage again with `from_stage='observations'`"
         ) from error
-    found = np.asarray(found)
+    samples = np.asarray(samples)
     first = (slice(None), *(slice(None, None, step) for step in array.chunks[1:]))
-    if np.isneginf(found[first]).any():
+    if np.isneginf(samples[first]).any():
         raise InputError(
             f"{location}: expected all chunks, found some missing; compute the stage again "
             "with `from_stage='observations'`"
         )
-    return found
+    return samples
 
 
 def opened(location: Location) -> str | FsspecStore:
@@ -260,9 +260,7 @@ def check_place(store: str, *, capture: Path, out: Path) -> None:
     """
     if "://" in store and not store.startswith("file://"):
         if not store.partition("://")[2].strip("/ "):
-            raise InputError(
-                f"store: expected a place, such as {store}/name, received {store}"
-            )
+            raise InputError(f"store: expected a place, such as {store}/name, received {store}")
         return
     text = store.removeprefix("file://")
     if not text.strip():
@@ -338,21 +336,21 @@ def create_samples(
     shape = (n_texels, n_views, n_lights, 3)
     chunks = (*chunk_shape(n_texels, n_views, n_lights), n_lights, 3)
     try:
-        found = _opened_array(location, "r+")
+        stored = _opened_array(location, "r+")
     except FileNotFoundError:
         return _created(location, shape, chunks, unit)
-    if (found.shape, found.chunks, str(found.dtype)) != (shape, chunks, "float16"):
+    if (stored.shape, stored.chunks, str(stored.dtype)) != (shape, chunks, "float16"):
         raise InputError(
-            f"{location}: expected float16 samples of shape {shape} in chunks {chunks}, found "
-            f"{found.dtype} of shape {found.shape} in chunks {found.chunks}; remove it, or use "
-            "another place"
+            f"{location}: expected float16 samples of shape {shape} in chunks {chunks}, "
+            f"found {stored.dtype} of shape {stored.shape} in chunks {stored.chunks}; remove "
+            "it, or use another place"
         )
-    if found.attrs.get(UNIT) != unit:
+    if stored.attrs.get(UNIT) != unit:
         raise InputError(
-            f"{location}: expected samples in units of {unit}, found {found.attrs.get(UNIT)}; "
+            f"{location}: expected samples in units of {unit}, found {stored.attrs.get(UNIT)}; "
             "remove it, or use another place"
         )
-    return found
+    return stored
 
 
 def _created(
@@ -416,8 +414,8 @@ def _opened_array(location: Location, mode: Literal["r", "r+"]) -> zarr.Array:
 def is_written(array: zarr.Array, part: tuple[slice, ...]) -> bool:
     """Whether the chunks of a part are all there and agree with their checksums."""
     try:
-        found = np.asarray(array[part])
+        samples = np.asarray(array[part])
     except ValueError:
         return False
     first = tuple(slice(None, None, step) for step in array.chunks)
-    return not np.isneginf(found[first]).any()
+    return not np.isneginf(samples[first]).any()

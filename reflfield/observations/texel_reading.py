@@ -272,15 +272,15 @@ class TexelReader:
 
         See `luminance_of` for samples of which not all channels were measured.
         """
-        found = self.measured(texels)
+        measured = self.measured(texels)
         frames = self.local_from_world[texels].astype(np.float64)
-        views = local_directions(frames, found.views.astype(np.float64))
-        lights = local_directions(frames, found.lights.astype(np.float64))
+        views = local_directions(frames, measured.views.astype(np.float64))
+        lights = local_directions(frames, measured.lights.astype(np.float64))
         cosines = np.ones(lights.shape[:2], np.float32)
         if self.sides[1] > 1:
             cosines = softened_cosine(lights[..., 2]).astype(np.float32)
-        values = luminance_of(found, cosines) * np.float32(found.unit)
-        samples = np.where(found.seen, values, np.float32(np.nan))
+        values = luminance_of(measured, cosines) * np.float32(measured.unit)
+        samples = np.where(measured.seen, values, np.float32(np.nan))
         if self.sides[0] == 1:
             samples, views = _mean_over(samples, 1), _upright(len(texels))
         if self.sides[1] == 1:

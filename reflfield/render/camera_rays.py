@@ -294,15 +294,15 @@ def _merge_taps(
             if not weights[i, j] > 0:
                 continue
             # The latest entries are the likeliest: neighbouring samples share texels.
-            found = n - 1
-            while found >= first and entry_texel[found] != texels[i, j]:
-                found -= 1
-            if found < first:
-                found = n
+            same = n - 1
+            while same >= first and entry_texel[same] != texels[i, j]:
+                same -= 1
+            if same < first:
+                same = n
                 entry_pixel[n] = pixel[i]
                 entry_texel[n] = texels[i, j]
                 n += 1
-            entry[i, j] = found
+            entry[i, j] = same
     return n
 
 

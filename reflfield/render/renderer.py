@@ -205,13 +205,13 @@ class Renderer:
         return Rendering(image, coverage)
 
     def _sources(self, lights: Lighting) -> list[Light | EnvironmentLighting]:
-        given = [lights] if isinstance(lights, Light | EnvironmentMap) else list(lights)
+        all_lights = [lights] if isinstance(lights, Light | EnvironmentMap) else list(lights)
         if self.field.light_model == "unknown":
-            return [Light("of the field", UNKNOWN)] if given else []
+            return [Light("of the field", UNKNOWN)] if all_lights else []
         # A frame may name several lights at once: they are one light of the capture.
         singles = [
             single
-            for light in given
+            for light in all_lights
             for single in (light.sources if isinstance(light, Light) else (light,))
         ]
         return [self._source(single) for single in singles]

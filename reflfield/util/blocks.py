@@ -170,13 +170,13 @@ class Results(Sequence[dict[str, NDArray[Any]]]):
     def __getitem__(self, number: Any) -> Any:
         if not 0 <= number < self.n_blocks:
             raise IndexError(number)
-        found = self.files.read(number)
-        if found is None:
+        answer = self.files.read(number)
+        if answer is None:
             raise InputError(
                 f"{self.files.path(number)}: expected the block that was written, found it "
                 "gone or damaged; leave the folder alone and run again"
             )
-        return found
+        return answer
 
     def joined(self, name: str) -> NDArray[Any]:
         """One array of all blocks, end to end."""
@@ -286,22 +286,22 @@ class Blocks:
         intact: Callable[[Any, Any], bool] | None,
     ) -> set[int]:
         """Blocks whose results, and what they wrote elsewhere, are there and verified."""
-        found = {n: block for n, block in enumerate(blocks) if files.read(n) is not None}
+        present = {n: block for n, block in enumerate(blocks) if files.read(n) is not None}
         if intact is None:
-            return set(found)
+            return set(present)
         answers: dict[int, bool] = {}
         self.scheduler.run(
-            partial(_checked, intact), context, found, answers.__setitem__, at_once=1
+            partial(_checked, intact), context, present, answers.__setitem__, at_once=1
         )
         return {n for n, answer in answers.items() if answer}
 
     def once(self, name: str, compute: Callable[[], Arrays]) -> dict[str, NDArray[Any]]:
         """Result of work that cannot be cut into blocks, done in this process and kept."""
         files = BlockFiles(self.folder / name)
-        found = files.read(0)
-        if found is not None:
+        answer = files.read(0)
+        if answer is not None:
             self.tally.resumed += 1
-            return found
+            return answer
         with self.tally.timing(name):
             files.write(0, compute())
         self.tally.computed += 1

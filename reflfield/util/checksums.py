@@ -138,11 +138,11 @@ def first_damaged(folder: Path, recorded: Mapping[str, Any]) -> str | None:
 
 
 def _store(chunks: Sequence[Path]) -> dict[str, int]:
-    found = [path.stat() for path in chunks]
+    states = [path.stat() for path in chunks]
     return {
-        "files": len(found),
-        "bytes": sum(status.st_size for status in found),
-        "newest": max(status.st_mtime_ns for status in found),
+        "files": len(states),
+        "bytes": sum(status.st_size for status in states),
+        "newest": max(status.st_mtime_ns for status in states),
     }
 
 

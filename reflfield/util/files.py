@@ -54,14 +54,14 @@ def check_regular(path: Path, error: type[InputError] = InputError) -> int:
         Of the type asked for, if the file is missing or a folder, pipe, device or socket.
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except (OSError, ValueError) as failure:
         reason = getattr(failure, "strerror", None) or failure
         raise error(f"{path}: cannot be read ({reason})") from failure
-    if not stat.S_ISREG(found.st_mode):
-        kind = next((name for test, name in _KINDS if test(found.st_mode)), "something else")
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((name for test, name in _KINDS if test(status.st_mode)), "something else")
         raise error(f"{path}: expected a file, received {kind}; name the file itself")
-    return found.st_size
+    return status.st_size
 
 
 def utf8_name(path: Path, error: type[InputError] = InputError) -> str:

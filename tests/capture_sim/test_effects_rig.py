@@ -38,7 +38,7 @@ def test_a_rig_without_effects_is_as_reported():
     rig = real_rig(plain)
     assert rig.cameras is plain.cameras
     assert rig.lights is plain.lights
-    assert rig.taken.all()
+    assert rig.photographed.all()
 
 
 def test_reported_calibration_stays_where_errors_are_not_calibrated():
@@ -150,7 +150,7 @@ def test_fall_off_is_a_power_of_the_cosine_about_the_object():
 
 def test_photographs_are_dropped_with_the_given_probability():
     thing = scene(n=40, dropped_photographs={"fraction": 0.1})
-    taken = real_rig(thing).taken
+    taken = real_rig(thing).photographed
     assert taken.shape == (40, 40)
     assert (~taken).mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.1 * 0.9 / 1600))
     assert str((~taken).sum()) in dropped_photographs.needed(thing).reason
