@@ -12,15 +12,15 @@ from reflfield.util.progress import report
 
 Array = NDArray[Any]
 SEEDING_DIMENSIONS = 16
-SEEDING_TURNS = 5
-# Seeds tried, on so many points (and one more per cluster), for so many turns each.
+SEEDING_ITERATIONS = 5
+# Seeds tried, on so many points (and one more per cluster), for so many iterations each.
 STARTS = 4
 START_POINTS = 8192
-START_TURNS = 10
+START_ITERATIONS = 10
 # Points whose distances to all clusters are held at once.
 POINTS_AT_ONCE = 8192
 # Iterations stop when the squared error falls by less than this share.
-LEAST_PROGRESS = 1e-4
+MIN_PROGRESS = 1e-4
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def cluster_columns(
 def alternate(
     points: Array, clusters: Clusters, iterations: int
 ) -> tuple[Clusters, list[float]]:
-    """Assign points and update clusters in turns; clusters and the squared error of each turn.
+    """Alternate assignment and update; return clusters and squared error of each iteration.
 
     The labels of the clusters that come in need not be those of the points.
     """
@@ -97,7 +97,7 @@ def alternate(
 
 
 def _converged(errors: list[float]) -> bool:
-    return len(errors) > 1 and errors[-1] >= (1 - LEAST_PROGRESS) * errors[-2]
+    return len(errors) > 1 and errors[-1] >= (1 - MIN_PROGRESS) * errors[-2]
 
 
 def nearest(points: Array, clusters: Clusters) -> tuple[NDArray[np.int32], Array]:
@@ -190,7 +190,7 @@ def without_empty(
 def best_start(
     points: Array, n_clusters: int, n_components: int, rng: np.random.Generator
 ) -> Clusters:
-    """Clusters of a share of the points, the best of several seeds after a few turns."""
+    """Clusters of a share of the points, the best of several seeds after a few iterations."""
     chosen = np.arange(len(points))
     if len(points) > START_POINTS + n_clusters:
         chosen = np.sort(rng.choice(len(points), START_POINTS + n_clusters, replace=False))
@@ -200,7 +200,7 @@ def best_start(
     for _ in range(STARTS if n_components else 1):
         labels = seeded_labels(share[:, :SEEDING_DIMENSIONS], n_clusters, rng)
         clusters = updated(share, labels, n_clusters, n_components)
-        clusters, _ = alternate(share, clusters, START_TURNS)
+        clusters, _ = alternate(share, clusters, START_ITERATIONS)
         error = float(nearest(share, clusters)[1].sum())
         if best is None or error < least:
             best, least = clusters, error
@@ -211,12 +211,12 @@ def best_start(
 def seeded_labels(
     points: Array, n_clusters: int, rng: np.random.Generator
 ) -> NDArray[np.int32]:
-    """k-means++ and a few turns of k-means."""
+    """Labels of k-means++ and a few iterations of k-means."""
     centres = points[kmeans_plus_plus(points, n_clusters, rng)]
     no_bases = np.zeros((*centres.shape, 0), dtype=points.dtype)
     clusters = Clusters(np.zeros(0, np.int32), centres, no_bases, np.zeros((n_clusters, 0)))
     labels, squared = nearest(points, clusters)
-    for _ in range(SEEDING_TURNS):
+    for _ in range(SEEDING_ITERATIONS):
         labels = without_empty(labels, squared, n_clusters)
         labels, squared = nearest(points, updated(points, labels, n_clusters, 0))
     return without_empty(labels, squared, n_clusters)

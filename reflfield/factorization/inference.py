@@ -48,8 +48,8 @@ def infer_coefficients(
     >>> from reflfield.factorization import complete
     >>> known = np.outer([1.0, 2.0, 2.0], [3.0, 1.0, 4.0, -2.0])
     >>> fit = complete(known, rank=1)
-    >>> found, _ = infer_coefficients(fit, np.array([[2.0], [4.0], [np.nan]]))
-    >>> (fit.mean[:, None] + fit.basis @ found.T).round(2).ravel()
+    >>> inferred, _ = infer_coefficients(fit, np.array([[2.0], [4.0], [np.nan]]))
+    >>> (fit.mean[:, None] + fit.basis @ inferred.T).round(2).ravel()
     array([2., 4., 4.])
     """
     source = as_source(matrix, observed, weights, n_channels)

@@ -35,9 +35,10 @@ LEAST_SHARE = 1e-3
 PSEUDO_OBSERVATIONS = 2.0
 # The same towards zero, for rows that the start has not fitted yet.
 EXTENDING_PSEUDO_OBSERVATIONS = 0.05
-# Blocks fitted on their own, turns each, and samples used: a dozen turns reach the noise.
-TRIALS = 3
-TURNS = 12
+# Blocks fitted on their own, iterations of each, and samples used: a dozen iterations reach the
+# noise.
+CANDIDATES = 3
+ITERATIONS = 12
 SAMPLES = 2048
 SAMPLES_PER_RANK = 32
 
@@ -77,10 +78,10 @@ def start_model(
     n_samples = reader.source.shape[0] // reader.n_channels
     samples = _some_samples(n_samples, rank, rng)
     best: tuple[float, Model, Posterior, Block] | None = None
-    for trial, data in enumerate(_informative_blocks(reader, order, block)):
+    for candidate, data in enumerate(_informative_blocks(reader, order, block)):
         part = rows_of(data, samples, reader.n_channels)
-        model = _first_model(part, rank, reader.n_channels, rng, trial)
-        fitted = _turns(model, part)
+        model = _first_model(part, rank, reader.n_channels, rng, candidate)
+        fitted = _alternated(model, part)
         if best is None or fitted[0] < best[0]:
             best = (*fitted, data)
     if best is None:
@@ -99,16 +100,16 @@ def _some_samples(n_samples: int, rank: int, rng: np.random.Generator) -> NDArra
 
 
 def _informative_blocks(reader: Reader, order: Columns, block: int) -> list[Block]:
-    """Blocks of well observed columns, one a trial; the same again if there are too few."""
-    found: list[Block] = []
+    """Blocks of well observed columns, one a candidate; the same again if there are too few."""
+    blocks: list[Block] = []
     for columns in blocks_of(order, block):
         data = reader.block(columns)
         kept = data.coverage >= reader.least_coverage
         if kept.any():
-            found.append(Block(columns[kept], data.values[:, kept], data.weights[:, kept]))
-        if len(found) == TRIALS:
-            return found
-    return [found[i % len(found)] for i in range(TRIALS)] if found else []
+            blocks.append(Block(columns[kept], data.values[:, kept], data.weights[:, kept]))
+        if len(blocks) == CANDIDATES:
+            return blocks
+    return [blocks[i % len(blocks)] for i in range(CANDIDATES)] if blocks else []
 
 
 def rows_of(data: Block, samples: NDArray[np.intp], n_channels: int) -> Block:
@@ -117,10 +118,10 @@ def rows_of(data: Block, samples: NDArray[np.intp], n_channels: int) -> Block:
     return Block(data.columns, values.reshape(-1, values.shape[2]), data.weights[samples])
 
 
-def _turns(model: Model, data: Block) -> tuple[float, Model, Posterior]:
-    """Coefficients and rows in turns; noise variance left, model, coefficients."""
+def _alternated(model: Model, data: Block) -> tuple[float, Model, Posterior]:
+    """Alternate coefficients and rows; return noise variance left, model, coefficients."""
     counted = np.ones(len(data.columns), dtype=np.bool_)
-    for _ in range(TURNS):
+    for _ in range(ITERATIONS):
         statistics = RowStatistics(model)
         statistics.add(data, infer(model, data, gram_of(model)), counted)
         model = resolve_online(with_moments(model, statistics), statistics, PSEUDO_OBSERVATIONS)
@@ -153,7 +154,7 @@ def _extended(model: Model, posterior: Posterior, data: Block) -> Model:
     return resolve_online(blank, statistics, EXTENDING_PSEUDO_OBSERVATIONS)
 
 
-# --- first subspace of a trial -----------------------------------------------------------
+# --- first subspace of a candidate -----------------------------------------------------------
 
 
 def _first_model(
@@ -161,12 +162,12 @@ def _first_model(
     rank: int,
     n_channels: int,
     rng: np.random.Generator,
-    trial: int,
+    candidate: int,
 ) -> Model:
     """Randomised SVD of a block with zeros where nothing was observed."""
     weights = np.repeat(data.weights, n_channels, axis=0)
     filled = weighted(data.values, data.weights, n_channels)
-    if trial > 0:
+    if candidate > 0:
         # Another beginning on what may be the same block.
         filled = filled * (0.5 + rng.random((filled.shape[1],))).astype(filled.dtype)
     basis, values = leading_vectors(filled, rank, rng)

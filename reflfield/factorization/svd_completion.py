@@ -135,7 +135,7 @@ def complete(
         it: a chunk is then read once a pass.
     restarts : int
         How often to start again with another column order if the training residual
-        does not settle.
+        does not converge.
     seed : int
         Of the column order and the starting basis.
 
@@ -199,12 +199,12 @@ def fit_map(
     passes: int,
     block: int,
     rng: np.random.Generator,
-    rival: float = np.inf,
+    limit: float = np.inf,
 ) -> Fit:
     """All passes of block recursive least squares.
 
     Rows are solved after every block in the first half of the passes, then once a pass.
-    A fit whose first residual is not below `rival` is given up after that pass.
+    A fit whose first residual is not below `limit` is abandoned after that pass.
     """
     order = shuffled_columns(reader.source, rng)
     model, floor = start_model(reader, order, rank, block, rng)
@@ -214,7 +214,7 @@ def fit_map(
         model, statistics = one_pass(reader, model, order, block, online=online)
         model = resolve_final(with_moments(model, statistics), statistics)
         residuals.append(statistics.residual)
-        if residuals[0] > rival:
+        if residuals[0] > limit:
             break
         order = shuffled_columns(reader.source, rng)
     variance = unbiased(
@@ -238,8 +238,8 @@ def _fit_restarting(
     while best.stalled and attempt < restarts:
         attempt += 1
         rng = np.random.default_rng([seed, attempt])
-        rival = 0.9 * best.residuals[0]
-        fit = fit_map(reader, rank, passes, block, rng, rival)
+        limit = 0.9 * best.residuals[0]
+        fit = fit_map(reader, rank, passes, block, rng, limit)
         if len(fit.residuals) == passes and fit.residuals[-1] < best.residuals[-1]:
             best = fit
     return best, attempt

@@ -1,4 +1,4 @@
-"""From fitted parts to a field: surface on a lattice, functions factored, all quantised."""
+"""Construction of a field from fitted parts: factor the functions, quantise everything."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class Quantisation:
     ----------
     step : float
         Quantisation step of every coefficient and, weighted by what the texels make of it,
-        of every number of the functions, in root mean square over the nodes in the
-        domain: each adds a twelfth of its square to the squared error. 0: as fine as is
+        of every number of the functions, in root mean square over the nodes, transformed:
+        each adds a twelfth of its square to the squared error. 0: as fine as is
         of any use.
     turn_deg : float
         Step of the frames, degrees about each axis. 0: the one at which a frame adds as much
@@ -114,13 +114,13 @@ class FittedReflectance:
     coefficients : (n_texels, K) float
         Weights of the basis of the texel's cluster; K may be 0.
     mean : (n_clusters, n_view_nodes, n_light_nodes, 3) float
-        Mean sample in the domain, at the nodes of the two grids.
+        Mean of the transformed samples at the nodes of the two grids.
     basis : (n_clusters, K, n_view_nodes, n_light_nodes, 3) float
-        Basis functions in the domain.
+        Basis functions of the transformed samples.
     domain : {"cube_root", "square_root", "linear"}
         What was applied to the samples.
     indirect : IndirectLight, optional
-        What texels show in traced shadows; nothing, if not given.
+        What texels show in traced shadows; black by default.
     """
 
     local_from_world: NDArray[np.floating]
@@ -346,34 +346,34 @@ def _coefficient_codes(
     codes = np.zeros((len(reflectance.cluster), n_functions - 1), np.int32)
     scale = np.zeros((n_clusters, n_functions - 1), np.float32)
     for c in range(n_clusters):
-        given = table[c].reshape(n_functions, -1).astype(np.float64)
+        fitted = table[c].reshape(n_functions, -1).astype(np.float64)
         read = decoded[c].reshape(n_functions, -1).astype(np.float64)
         members = np.flatnonzero(np.asarray(reflectance.cluster) == c)
         gram = read[1:] @ read[1:].T / read.shape[1]
-        between = given[1:] @ read[1:].T / read.shape[1]
-        shift = (given[0] - read[0]) @ read[1:].T / read.shape[1]
+        between = fitted[1:] @ read[1:].T / read.shape[1]
+        shift = (fitted[0] - read[0]) @ read[1:].T / read.shape[1]
         moments = np.asarray(reflectance.coefficients)[members] @ between + shift
         codes[members], scale[c] = lattice_codes(moments, gram, step)
     return codes, scale
 
 
-def quantisation_error(given: FittedReflectance, field: ReflectanceField) -> float:
-    """Root mean square over texels and nodes, in the domain, of what quantisation changed.
+def quantisation_error(fitted: FittedReflectance, field: ReflectanceField) -> float:
+    """Root mean square error of quantisation over texels and nodes, of transformed values.
 
     From the Gram matrices of the functions before and after; no texel's nodes are formed.
     """
-    total, n_nodes = 0.0, given.mean[0].size
+    total, n_nodes = 0.0, fitted.mean[0].size
     for c in range(field.n_clusters):
-        members = np.flatnonzero(np.asarray(given.cluster) == c)
-        before = np.concatenate([given.mean[c][None], given.basis[c]]).reshape(-1, n_nodes)
+        members = np.flatnonzero(np.asarray(fitted.cluster) == c)
+        before = np.concatenate([fitted.mean[c][None], fitted.basis[c]]).reshape(-1, n_nodes)
         after = np.moveaxis(field.node_table[c], 2, 0).reshape(-1, n_nodes)
         both = np.concatenate([before, after]).astype(np.float64)
         ones = np.ones((len(members), 1))
         factors = np.concatenate(
-            [ones, given.coefficients[members], -ones, -field.coefficients[members]], axis=1
+            [ones, fitted.coefficients[members], -ones, -field.coefficients[members]], axis=1
         )
         total += np.sum((factors @ (both @ both.T)) * factors)
-    return float(np.sqrt(max(total, 0.0) / (n_nodes * max(len(given.cluster), 1))))
+    return float(np.sqrt(max(total, 0.0) / (n_nodes * max(len(fitted.cluster), 1))))
 
 
 def _matching_turn(

@@ -104,8 +104,8 @@ def _solve_bounded(
 ) -> None:
     """Coefficients of one texel, with as strong a prior as keeps it within its bounds.
 
-    The stronger prior moves first what the samples say least of. It goes no further than their
-    errors allow: a texel that they show to be unlike its cluster remains so.
+    The stronger prior first changes what the samples determine least. It goes no further than
+    their errors allow: a texel that they show to be unlike its cluster remains so.
     """
     before = squares.copy()
     _solve_texel(normal, right, precision, n_values, coefficients, squares)
@@ -201,7 +201,7 @@ def solve_coefficients(
     pool : ThreadPoolExecutor
     bounded : bool
         Whether a texel may be nowhere brighter than its samples and, by a factor, than the
-        mean of its cluster: where it was not observed its coefficients may say anything.
+        mean of its cluster: where it was not observed its coefficients are undetermined.
 
     Returns
     -------

@@ -90,7 +90,7 @@ class IndirectModel:
         """Posterior means of some texels, (n, K); 0 without shade.
 
         A texel that would show more, under one of the lights without a sample, than in any
-        of its samples is asked again with that light sample at its brightest, which counts
+        of its samples is solved again with that light's sample at its brightest, which counts
         as known to `LIMIT_SHARE`: little where the samples determine the coefficients.
         """
         if not len(self.variances):
@@ -218,15 +218,15 @@ def fit_indirect(
         return IndirectModel(nothing, np.zeros((len(nothing), 0)), np.zeros(0), 1.0)
     # In units of their own size, so that all constants are shares.
     systems = [system.divided_by(size) for system in systems]
-    found = _start(systems, band_limit)
+    model = _initial(systems, band_limit)
     for _ in range(ROUNDS):
-        found = _maximised(systems, found)
-    values, vectors = np.linalg.eigh(found.covariance)
+        model = _maximised(systems, model)
+    values, vectors = np.linalg.eigh(model.covariance)
     order = np.argsort(-values, kind="stable")[:n_components]
     kept = order[values[order] > LEAST_SHARE]
     squared = size**2
     return IndirectModel(
-        found.mean * size, vectors[:, kept], values[kept] * squared, found.noise * squared
+        model.mean * size, vectors[:, kept], values[kept] * squared, model.noise * squared
     )
 
 
@@ -248,7 +248,7 @@ class _Gaussian:
     noise: float
 
 
-def _start(systems: list[Systems], band_limit: int) -> _Gaussian:
+def _initial(systems: list[Systems], band_limit: int) -> _Gaussian:
     """Mean by regularised least squares over all texels, and a covariance of smooth light."""
     degree = np.repeat(np.floor(np.sqrt(np.arange(n_coefficients(band_limit)))), 3)
     smooth = degree * (degree + 1.0)
@@ -265,18 +265,18 @@ def _maximised(systems: list[Systems], before: _Gaussian) -> _Gaussian:
     total, outer = np.zeros_like(before.mean), np.zeros_like(before.covariance)
     residual, count, n = 0.0, 0.0, 0
     for s in systems:
-        # A texel without samples says nothing.
+        # Texels without samples are excluded.
         seen = s.count > 0
         gram, moments = s.gram[seen], s.moments[seen]
         # Without inverting the covariance, which may be nearly singular.
         ratio = one + before.covariance @ gram / before.noise
         spread = np.linalg.solve(ratio, np.broadcast_to(before.covariance, ratio.shape))
         left = (moments - gram @ before.mean) / before.noise
-        found = before.mean + (spread @ left[..., None])[..., 0]
-        total += found.sum(axis=0)
-        outer += found.T @ found + spread.sum(axis=0)
-        # Expected squared residual: of the mean, and what is open about it.
-        fitted = ((gram @ found[..., None])[..., 0] - 2.0 * moments) * found
+        posterior = before.mean + (spread @ left[..., None])[..., 0]
+        total += posterior.sum(axis=0)
+        outer += posterior.T @ posterior + spread.sum(axis=0)
+        # Expected squared residual: of the posterior mean, and of its uncertainty.
+        fitted = ((gram @ posterior[..., None])[..., 0] - 2.0 * moments) * posterior
         residual += float(s.energy[seen].sum() + fitted.sum() + np.sum(spread * gram))
         count += float(s.count[seen].sum())
         n += int(seen.sum())

@@ -16,7 +16,7 @@ from reflfield.errors import InputError
 from reflfield.sphere.rotations import matrix_from_quaternion, quaternion_from_matrix
 from reflfield.util.validation import check_shape
 
-# Half a turn in steps of this fits the codes of a turn.
+# Half a revolution in steps of this fits the codes of a rotation.
 SMALLEST_TURN = 1e-4
 # A function whose component orthogonal to the others is below this share of the strongest is
 # linearly dependent on them.

@@ -1,4 +1,4 @@
-"""As many bits as a size or a quality asks for: the step of the quantisation, searched."""
+"""Search of the quantisation step for the file size or the quality that is asked for."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Build = Callable[[float], ReflectanceField]
 WIDEST = 2.0**12
 # A file this share below the size that is asked for is close enough.
 CLOSE = 0.005
-MOST_TRIALS = 14
+MAX_CANDIDATES = 14
 # Where a search begins without a residual: this share of the root mean square of the means.
 START_SHARE = 2.0**-10
 
@@ -49,20 +49,20 @@ def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
     step = _first_step(build, step)
     bracket = _Bracket(log2(step / WIDEST), log2(step * WIDEST))
     best, at = None, log2(step)
-    for _ in range(MOST_TRIALS):
+    for _ in range(MAX_CANDIDATES):
         field = build(2.0**at)
-        found = sizes.of(field)
-        bracket.tighten(at, found, size)
-        if found <= size:
+        n_bytes = sizes.of(field)
+        bracket.tighten(at, n_bytes, size)
+        if n_bytes <= size:
             best = field
-            if found >= (1.0 - CLOSE) * size:
+            if n_bytes >= (1.0 - CLOSE) * size:
                 break
         if bracket.width < 1e-3:
             break
         at = bracket.next(size)
     if best is None:
         raise InputError(
-            f"size: expected at least {found:,} bytes, which surface, texture map and frames "
+            f"size: expected at least {n_bytes:,} bytes, which surface, texture map and frames "
             f"take at the coarsest, received {size:,}; fewer texels make it smaller "
             "(texture.texels_per_pixel, hull.n_triangles)"
         )
@@ -84,12 +84,12 @@ class _Bracket:
         """Of what is left."""
         return self.high - self.low
 
-    def tighten(self, at: float, found: int, size: int) -> None:
-        """Move the end on whose side a trial fell."""
-        if found > size:
-            self.low, self.bytes_low = at, found
+    def tighten(self, at: float, n_bytes: int, size: int) -> None:
+        """Move the end on whose side a candidate fell."""
+        if n_bytes > size:
+            self.low, self.bytes_low = at, n_bytes
         else:
-            self.high, self.bytes_high = at, found
+            self.high, self.bytes_high = at, n_bytes
 
     def next(self, size: int) -> float:
         """Where the size is expected, by interpolation between two ends that are known.
@@ -120,7 +120,7 @@ def _first_step(build: Build, step: float) -> float:
 def field_of_quality(
     build: Build, measure: Callable[[ReflectanceField], float], step: float, least: float
 ) -> ReflectanceField:
-    """Smallest field that is at least so good; the finest if none is.
+    """Smallest field of at least a quality; the finest if none reaches it.
 
     Parameters
     ----------

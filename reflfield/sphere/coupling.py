@@ -1,9 +1,9 @@
-r"""Coupled harmonics: functions of two directions that turn by one rotation.
+r"""Coupled harmonics: functions of two directions that one rotation rotates.
 
 Products :math:`y_{\ell_1 m_1}(\omega_v)\, y_{\ell_2 m_2}(\omega_l)` of real harmonics are
 recombined by Clebsch-Gordan coefficients into functions of total degree `j`, one
 channel per pair (l1, l2) with ``|l1 - l2| <= j <= l1 + l2``. Under a common
-rotation of both directions every channel turns by the same :math:`\Delta^j(R)`,
+rotation of both directions every channel is rotated by the same :math:`\Delta^j(R)`,
 so the correlation of two such functions over all common rotations is one
 SO(3) series,
 
@@ -342,12 +342,12 @@ def uncouple(coupled: Coupled) -> NDArray[np.floating]:
 
 
 def rotate_coupled(coupled: Coupled, blocks: NDArray[np.floating]) -> Coupled:
-    r"""Coefficients of functions turned by :math:`R`, from `rotation_blocks` of R.
+    r"""Coefficients of functions rotated by :math:`R`, from `rotation_blocks` of R.
 
     Parameters
     ----------
     coupled : Coupled
-        n functions, or one that all rotations turn.
+        n functions, or one that all rotations apply to.
     blocks : (n, ...) or (1, ...) float
         `reflfield.sphere.wigner.rotation_blocks` with ``degree_limit = coupled.n_degrees``.
 
@@ -355,14 +355,14 @@ def rotate_coupled(coupled: Coupled, blocks: NDArray[np.floating]) -> Coupled:
     -------
     Coupled
     """
-    turned, offset = [], 0
+    rotated, offset = [], 0
     for j, block in enumerate(coupled.blocks):
         size = 2 * j + 1
         delta = blocks[:, offset : offset + size * size].astype(block.dtype)
         if len(block) == 1:
             product = delta.reshape(-1, size) @ block[0]
-            turned.append(product.reshape(len(delta), size, -1))
+            rotated.append(product.reshape(len(delta), size, -1))
         else:
-            turned.append(np.matmul(delta.reshape(-1, size, size), block))
+            rotated.append(np.matmul(delta.reshape(-1, size, size), block))
         offset += size * size
-    return Coupled(coupled.band_limits, tuple(turned))
+    return Coupled(coupled.band_limits, tuple(rotated))

@@ -25,7 +25,7 @@ from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.util.validation import check_shape, unit_directions
 
 # Shrinks the highest degree by this share where samples determine it fully; enough to
-# hold what a sparse dome leaves open, too little to blunt what it shows.
+# regularise what a sparse dome does not determine, too little to blur what it does.
 SMOOTHING = 1e-3
 # Of the way to the fit that unobserved samples go in each round of filling.
 FILLING_SHARES = (2.0, 1.0)

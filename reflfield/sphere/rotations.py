@@ -1,6 +1,6 @@
 """Rotations. The conventions of this header hold everywhere in the package.
 
-* Rotations are active: ``R @ v`` is the turned vector in the same frame.
+* Rotations are active: ``R @ v`` is the rotated vector in the same frame.
 * Quaternions are scalar first, ``(w, x, y, z)``, with ``w >= 0``.
 * Euler angles are zyz, ``R = Rz(alpha) @ Ry(beta) @ Rz(gamma)``, radians.
 * A local frame is stored as ``local_from_world`` (or ``local_from_base``): its
@@ -77,7 +77,7 @@ def rotation_angle(matrix: ArrayLike) -> Array:
 
 
 def frames_from_normals(normals: ArrayLike, tangent_hints: ArrayLike) -> Array:
-    """Right-handed frames with the given normals and tangents near the hints.
+    """Right-handed frames with these normals and tangents near the hints.
 
     Parameters
     ----------

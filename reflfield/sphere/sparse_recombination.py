@@ -1,8 +1,8 @@
 r"""One sparse matrix times many vectors that lie in rows of memory: recombined coefficients.
 
 A product of SciPy's takes the vectors in columns, and so copies them before and after, each
-time through memory. Here some vectors at a time are turned into columns that stay in the
-cache, multiplied a few rows of the matrix at a time, and turned back.
+time through memory. Here some vectors at a time are transposed into columns that stay in the
+cache, multiplied a few rows of the matrix at a time, and transposed back.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 r"""Wigner-d functions, and the matrices that rotate real harmonic coefficients.
 
 Complex convention: :math:`D^j_{mn}(R) = e^{-im\alpha} d^j_{mn}(\beta) e^{-in\gamma}` with
-``R = Rz(alpha) @ Ry(beta) @ Rz(gamma)``; the coefficients of the turned
+``R = Rz(alpha) @ Ry(beta) @ Rz(gamma)``; the coefficients of the rotated
 function :math:`f(R^T\omega)` are :math:`D(R)` times those of :math:`f`. The same
 holds for the real matrices :math:`\Delta^j(R)` of this module and the real harmonics of
 `reflfield.sphere.harmonics`: :math:`\Delta^1(R)` is `R` in the order (y, z, x) and

@@ -232,7 +232,7 @@ def test_no_texel_is_made_brighter_than_it_was_seen(monkeypatch, rng):
 
     # The sample, and three standard deviations of its noise and of the model's.
     assert brightest() < 0.1 + 6 * 0.02
-    monkeypatch.setattr("reflfield.field.indirect_light.LIMIT_ROUNDS", 0)
+    monkeypatch.setattr("reflfield.field.indirect_fit.LIMIT_ROUNDS", 0)
     assert brightest() > 0.5
 
 
