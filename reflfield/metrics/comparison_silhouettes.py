@@ -1,4 +1,4 @@
-"""Silhouettes of frames that are compared: made once, from more than the frames show."""
+"""Silhouettes of photographs that are compared: made once, from more than they show."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ HEADER_BYTES = 4096
 
 
 @dataclass(frozen=True, eq=False)
-class FrameSilhouettes:
-    """Silhouettes of the views of some frames, on disk.
+class ComparisonSilhouettes:
+    """Silhouettes of the views of some photographs, on disk.
 
     Parameters
     ----------
     folder : Path
-        As `write_frame_silhouettes` leaves it.
+        As `write_comparison_silhouettes` leaves it.
     cameras : tuple of Camera
         Of the views.
     origins : tuple of {"given", "alpha", "photographs", "hull", "image"}
@@ -53,16 +53,16 @@ class FrameSilhouettes:
         return stored["coverage"].astype(np.float32) / np.float32(255)
 
 
-def open_frame_silhouettes(folder: Path, frames: Capture) -> FrameSilhouettes:
-    """Open what `write_frame_silhouettes` has left of the same frames."""
+def open_frame_silhouettes(folder: Path, frames: Capture) -> ComparisonSilhouettes:
+    """Open what `write_comparison_silhouettes` has left of the same photographs."""
     origins = json.loads((folder / ORIGINS).read_text())
-    return FrameSilhouettes(folder, frames.cameras, tuple(origins))
+    return ComparisonSilhouettes(folder, frames.cameras, tuple(origins))
 
 
-def write_frame_silhouettes(
+def write_comparison_silhouettes(
     frames: Capture, around: Capture, mesh: Mesh, folder: Path, threads: int = 0
-) -> FrameSilhouettes:
-    """Make and store the silhouette of every view of some frames.
+) -> ComparisonSilhouettes:
+    """Make and store the silhouette of every view of some photographs.
 
     The one given for the view; else the alpha of its photographs; else, where the base
     surface is a plane, the whole image; else one made from all photographs of its camera,
@@ -72,7 +72,7 @@ def write_frame_silhouettes(
     Parameters
     ----------
     frames : Capture
-        Frames that are compared.
+        Photographs that are compared.
     around : Capture
         What they are part of, with cameras of the same names: all photographs.
     mesh : Mesh
@@ -84,7 +84,7 @@ def write_frame_silhouettes(
 
     Returns
     -------
-    FrameSilhouettes
+    ComparisonSilhouettes
     """
     folder.mkdir(parents=True, exist_ok=True)
     scene, ids = RayScene(mesh, threads), [camera.id for camera in around.cameras]
@@ -95,7 +95,7 @@ def write_frame_silhouettes(
         np.savez_compressed(_file(folder, view), coverage=pixels)
         origins.append(origin)
     (folder / ORIGINS).write_text(json.dumps(origins))
-    return FrameSilhouettes(folder, frames.cameras, tuple(origins))
+    return ComparisonSilhouettes(folder, frames.cameras, tuple(origins))
 
 
 def _file(folder: Path, view: int) -> Path:

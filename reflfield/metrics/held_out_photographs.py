@@ -12,37 +12,37 @@ from reflfield.capture.capture import Capture
 from reflfield.capture.image_files import read_image
 from reflfield.errors import NumericalError
 from reflfield.field.reflectance_field import ReflectanceField
-from reflfield.metrics.comparison_silhouettes import FrameSilhouettes
-from reflfield.metrics.image_metrics import Comparison, FramePair, compare_frames
-from reflfield.render.relit_photographs import relight_frames
+from reflfield.metrics.comparison_silhouettes import ComparisonSilhouettes
+from reflfield.metrics.image_metrics import Comparison, ImagePair, compare_images
+from reflfield.render.relit_photographs import relight_photographs
 from reflfield.render.renderer import RenderOptions
 
 
 @dataclass(frozen=True, eq=False)
 class RelitPairs:
-    """Frames with their relit pictures on disk; may be iterated any number of times.
+    """Photographs with their rendered images on disk; may be iterated any number of times.
 
     Parameters
     ----------
     frames : Capture
         Photographs.
     folder : Path
-        Holds NAME.exr of every frame.
-    silhouettes : FrameSilhouettes
-        Of the views of the frames.
+        Holds NAME.exr of every photograph.
+    silhouettes : ComparisonSilhouettes
+        Of the views of the photographs.
     """
 
     frames: Capture
     folder: Path
-    silhouettes: FrameSilhouettes
+    silhouettes: ComparisonSilhouettes
 
     def __len__(self) -> int:
         return len(self.frames.photographs)
 
-    def __iter__(self) -> Iterator[FramePair]:
+    def __iter__(self) -> Iterator[ImagePair]:
         for i, photograph in enumerate(self.frames.photographs):
             radiance, measured = self.frames.read_measured(i)
-            yield FramePair(
+            yield ImagePair(
                 name=photograph.name,
                 photograph=radiance,
                 relit=read_image(self.folder / f"{photograph.name}.exr"),
@@ -53,7 +53,7 @@ class RelitPairs:
             )
 
     def measured_in(self, comparison: Comparison) -> RelitPairs:
-        """Those frames alone that a comparison of them has measured."""
+        """Those photographs alone that a comparison of them has measured."""
         names = {frame.name for frame in comparison.frames}
         kept = tuple(p for p in self.frames.photographs if p.name in names)
         return replace(self, frames=replace(self.frames, photographs=kept))
@@ -62,21 +62,21 @@ class RelitPairs:
 def compare_with_photographs(
     field: ReflectanceField,
     frames: Capture,
-    silhouettes: FrameSilhouettes,
+    silhouettes: ComparisonSilhouettes,
     folder: Path,
     options: RenderOptions | None = None,
 ) -> Comparison:
-    """Relight frames into a folder and measure them against their photographs.
+    """Render photographs into a folder and measure the images against them.
 
     Parameters
     ----------
     field : ReflectanceField
     frames : Capture
         Cameras, lights, photographs.
-    silhouettes : FrameSilhouettes
-        Of the views of the frames.
+    silhouettes : ComparisonSilhouettes
+        Of the views of the photographs.
     folder : Path
-        Gets NAME.exr and NAME.png of every frame.
+        Gets NAME.exr and NAME.png of every photograph.
     options : RenderOptions, optional
 
     Returns
@@ -86,17 +86,17 @@ def compare_with_photographs(
     Raises
     ------
     InputError
-        If there is no frame, or none that can be measured.
+        If there is no photograph, or none that can be measured.
     NumericalError
         If what the field shows is not finite.
     """
-    for frame in relight_frames(field, frames, folder, options):
+    for frame in relight_photographs(field, frames, folder, options):
         if not np.isfinite(frame.rendering.image).all():
             raise NumericalError(
-                f"frame {frame.name!r}: expected finite radiance of the field, received "
+                f"photograph {frame.name!r}: expected finite radiance of the field, received "
                 "NaN or infinity: its values are too large; make the field again"
             )
-    return compare_frames(RelitPairs(frames, folder, silhouettes))
+    return compare_images(RelitPairs(frames, folder, silhouettes))
 
 
 def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:

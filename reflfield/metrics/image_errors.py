@@ -1,4 +1,4 @@
-"""How far two pictures are apart, pixel by pixel."""
+"""How far two images are apart, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Image = NDArray[np.float64]
 
 # A 0.7 m wide screen of 3840 pixels seen from 0.7 m, FLIP's own default.
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
-# Equal pictures have no error and an infinite PSNR, which JSON cannot hold and
+# Equal images have no error and an infinite PSNR, which JSON cannot hold and
 # no mean survives. 100 dB is an error of 1e-5 of the peak, below half floats.
 PSNR_CAP_DB = 100.0
-# skimage's default window; smaller only for pictures that it does not fit into.
+# skimage's default window; smaller only for images that it does not fit into.
 SSIM_WINDOW_PX = 7
-# Pixels of a picture that are looked at together; a measure takes 500 bytes of each.
+# Pixels of an image that are looked at together; a measure takes 500 bytes of each.
 PIXELS_AT_ONCE = 1 << 19
 # Rows beside a strip that its measures look at: FLIP's filters reach 10 pixels.
 HALO_PX = 32
@@ -48,7 +48,7 @@ def strips(height: int, width: int) -> Iterator[tuple[slice, slice, slice]]:
 def psnr(reference: ArrayLike, test: ArrayLike) -> float:
     r"""Peak signal-to-noise ratio for peak 1, :math:`-10 \log_{10} \mathrm{MSE}`, dB.
 
-    At most `PSNR_CAP_DB`, which equal pictures get.
+    At most `PSNR_CAP_DB`, which equal images get.
 
     Examples
     --------
@@ -62,7 +62,7 @@ def psnr(reference: ArrayLike, test: ArrayLike) -> float:
 
 
 def psnr_of_mean_square(mean_square: float) -> float:
-    """`psnr` of pictures whose squared differences have this mean, dB.
+    """`psnr` of images whose squared differences have this mean, dB.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def ssim_map(reference: Image, test: Image) -> Image:
        assessment: from error visibility to structural similarity", IEEE
        Transactions on Image Processing 13(4), 2004.
     """
-    # At least 5: smaller pictures have no object pixels.
+    # At least 5: smaller images have no object pixels.
     fitting = min(SSIM_WINDOW_PX, *reference.shape[:2])
     window = fitting if fitting % 2 else fitting - 1
     _, similarity = structural_similarity(

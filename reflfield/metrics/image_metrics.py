@@ -1,4 +1,4 @@
-"""How close relit pictures are to photographs, in the units of the literature.
+"""How close rendered images are to photographs, in the units of the literature.
 
 All measures are taken over the *object pixels* of `reflfield.render.exposure`, at the common
 exposure of the photographs; nothing is rescaled per image or per channel.
@@ -33,8 +33,8 @@ from reflfield.render.exposure import (
 
 Image = NDArray[np.float64]
 
-# What is said of a frame, in the order of ``metrics.json``.
-FRAME_KEYS = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels", "n_excluded",
+# What is said of a photograph, in the order of ``metrics.json``.
+METRIC_KEYS = ("name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels", "n_excluded",
               "silhouette_from")  # fmt: skip
 
 DEFINITIONS: Mapping[str, str] = {
@@ -42,26 +42,26 @@ DEFINITIONS: Mapping[str, str] = {
     "exposure": "1 / 99.5th percentile of the photographs' luminance over all object pixels",
     "psnr_ldr": "on sRGB(clip(exposure * x, 0, 1)), peak 1, dB, capped",
     "psnr_hdr": "on exposure * x, peak 1, dB, capped",
-    "ssim": "scikit-image, uniform 7 x 7 window, on the LDR pictures, map averaged",
+    "ssim": "scikit-image, uniform 7 x 7 window, on the LDR images, map averaged",
     "flip": "LDR-FLIP, map averaged; 0 is equal, 1 is the worst",
-    "backdrop": "black in both pictures where coverage < 0.5, so windows do not see it",
-    "excluded": "pixels where the photograph is saturated; equal in both pictures, not counted",
+    "backdrop": "black in both images where coverage < 0.5, so windows do not see it",
+    "excluded": "pixels where the photograph is saturated; equal in both images, not counted",
     "colour_ratio": "sum of relit / sum of photograph over object pixels, per channel",
 }
 
 
 class NothingToMeasure(InputError):
-    """No frame shows a pixel of the object that could be measured."""
+    """No photograph shows a pixel of the object that could be measured."""
 
 
 @dataclass(frozen=True, eq=False)
-class FramePair:
-    """A photograph and the picture rendered for the same camera and light.
+class ImagePair:
+    """A photograph and the image rendered for the same camera and light.
 
     Attributes
     ----------
     name : str
-        Frame name, quoted in results and errors.
+        Name of the photograph, quoted in results and errors.
     photograph, relit : (h, w, 3) float
         Linear radiance.
     silhouette : (h, w) float
@@ -87,8 +87,8 @@ class FramePair:
 
 
 @dataclass(frozen=True)
-class FrameMetrics:
-    """Measures of one frame; see `DEFINITIONS`.
+class ImageMetrics:
+    """Measures of one photograph; see `DEFINITIONS`.
 
     Attributes
     ----------
@@ -116,39 +116,39 @@ class FrameMetrics:
     silhouette_from: str = "given"
 
     def to_dict(self) -> dict[str, Any]:
-        """What ``metrics.json`` says of the frame; see `Comparison.from_dict`."""
-        return {key: getattr(self, key) for key in FRAME_KEYS}
+        """What ``metrics.json`` says of the photograph; see `Comparison.from_dict`."""
+        return {key: getattr(self, key) for key in METRIC_KEYS}
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Measures of all frames, their mean, and how they were taken.
+    """Measures of all photographs, their mean, and how they were taken.
 
     Attributes
     ----------
-    frames : tuple of FrameMetrics
+    frames : tuple of ImageMetrics
     exposure : float
-        The factor e that all pictures were multiplied with.
+        The factor e that all images were multiplied with.
     warnings : tuple of str
         What a reader of the numbers should know.
     not_measured : tuple of str
-        Frames that show no pixel of the object that could be measured.
+        Photographs that show no pixel of the object that could be measured.
     """
 
-    frames: tuple[FrameMetrics, ...]
+    frames: tuple[ImageMetrics, ...]
     exposure: float
     warnings: tuple[str, ...] = ()
     not_measured: tuple[str, ...] = ()
 
     @property
     def mean(self) -> dict[str, float]:
-        """Plain mean over frames of every measure."""
+        """Plain mean over photographs of every measure."""
         keys = ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels")
         return {k: float(np.mean([getattr(f, k) for f in self.frames])) for k in keys}
 
     @property
     def colour_ratio(self) -> tuple[float | None, ...]:
-        """Mean over frames of the ratio relit / photograph, per channel."""
+        """Mean over photographs of the ratio relit / photograph, per channel."""
         columns = zip(*(f.colour_ratio for f in self.frames), strict=True)
         kept = [[r for r in column if r is not None] for column in columns]
         return tuple(float(np.mean(column)) if column else None for column in kept)
@@ -174,7 +174,7 @@ class Comparison:
 
     @property
     def measured(self) -> dict[str, Any]:
-        """On what the measures were taken: counts over all frames."""
+        """On what the measures were taken: counts over all photographs."""
         origins = [frame.silhouette_from for frame in self.frames]
         return {
             "frames": len(self.frames),
@@ -190,7 +190,7 @@ class Comparison:
         extra = content["extra"]
         ratios = {more["name"]: tuple(more["colour_ratio"]) for more in extra["frames"]}
         frames = tuple(
-            FrameMetrics(**frame, colour_ratio=ratios[frame["name"]])
+            ImageMetrics(**frame, colour_ratio=ratios[frame["name"]])
             for frame in content["frames"]
         )
         return Comparison(
@@ -201,12 +201,12 @@ class Comparison:
         )
 
     def to_json(self) -> str:
-        """``metrics.json``: frames, mean, and under "extra" what else was found."""
+        """``metrics.json``: photographs, mean, and under "extra" what else was found."""
         return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
 
 
 def metrics_text(compared: Mapping[str, Any] | None, **more: Any) -> str:
-    """Text of ``metrics.json``: every frame, the mean, on what they were measured, and more."""
+    """Text of ``metrics.json``: every photograph, the mean, what was measured, and more."""
     nothing: dict[str, Any] = {"frames": [], "mean": {}, "measured": {}}
     kept = nothing if compared is None else {name: compared[name] for name in nothing}
     return json.dumps({**kept, **more}, indent=2, allow_nan=False) + "\n"
@@ -218,7 +218,7 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     Parameters
     ----------
     pictures : iterable of ((h, w, 3), (h, w))
-        Photograph (linear) and silhouette of every frame; or, instead of the silhouette,
+        Photograph (linear) and its silhouette; or, instead of the silhouette,
         True for the pixels that count.
 
     Returns
@@ -230,7 +230,7 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     Raises
     ------
     InputError
-        If no frame has an object pixel.
+        If no photograph has an object pixel.
 
     Examples
     --------
@@ -245,20 +245,20 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     if meter.is_empty:
         raise NothingToMeasure(
             "frames: expected at least one object pixel to set the exposure from, received "
-            f"none in {n_frames} frames; check the silhouettes"
+            f"none in {n_frames} photographs; check the silhouettes"
         )
     return meter.exposure
 
 
-def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -> Comparison:
-    """Measure relit pictures against photographs, all at one exposure.
+def compare_images(frames: Iterable[ImagePair], exposure: float | None = None) -> Comparison:
+    """Measure rendered images against photographs, all at one exposure.
 
     Parameters
     ----------
-    frames : iterable of FramePair
+    frames : iterable of ImagePair
         Read twice (exposure, then measures). A one-shot iterator is kept in
         memory; pass an object that can be iterated again, or `exposure`, to
-        hold one frame at a time.
+        hold one photograph at a time.
     exposure : float, optional
         Exposure from `common_exposure`, if known already.
 
@@ -266,22 +266,22 @@ def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -
     -------
     Comparison
 
-        Frames without a pixel that counts are left out and named.
+        Photographs without a pixel that counts are left out and named.
 
     Raises
     ------
     InputError
-        If there is no frame, or none with a pixel that counts, or a value under one is
-        not finite. The message names the frame.
+        If there is no photograph, or none with a pixel that counts, or a value under one is
+        not finite. The message names the photograph.
     ShapeError
-        If photograph, relit picture and silhouette differ in size.
+        If photograph, rendered image and silhouette differ in size.
 
     Examples
     --------
     White photographs, relit 10 % too dark: HDR error 0.1, so 20 dB.
 
     >>> white = np.ones((16, 16, 3))
-    >>> result = compare_frames([FramePair("a", white, 0.9 * white, np.ones((16, 16)))])
+    >>> result = compare_images([ImagePair("a", white, 0.9 * white, np.ones((16, 16)))])
     >>> round(result.mean["psnr_hdr"], 9), result.frames[0].n_pixels
     (20.0, 144)
     """
@@ -295,47 +295,49 @@ def compare_frames(frames: Iterable[FramePair], exposure: float | None = None) -
     measured, left_out = [], []
     for pair in pairs:
         if pair.counted.any():
-            measured.append(measure_frame(pair, exposure))
+            measured.append(measure_image(pair, exposure))
         else:
             left_out.append(pair.name)
     if not measured:
         raise NothingToMeasure(
-            "frames: expected at least one frame with object pixels to compare, received none"
+            "frames: expected at least one photograph with object pixels to compare, "
+            "received none"
             + (f" ({', '.join(left_out)} have none); check the silhouettes" if left_out else "")
         )
     return Comparison(tuple(measured), exposure, notes, tuple(left_out))
 
 
-def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
-    """Measures of one frame at a given exposure.
+def measure_image(pair: ImagePair, exposure: float) -> ImageMetrics:
+    """Measures of one photograph at a given exposure.
 
     Parameters
     ----------
-    pair : FramePair
+    pair : ImagePair
     exposure : float
         From `common_exposure`.
 
     Returns
     -------
-    FrameMetrics
+    ImageMetrics
 
     Raises
     ------
     InputError
-        If the frame has no object pixel or a value under one is not finite.
+        If the photograph has no object pixel or a value under one is not finite.
     ShapeError
-        If the pictures differ in size.
+        If the images differ in size.
     """
     check_pair(pair)
     counted = pair.counted
     if not counted.any():
         raise InputError(
-            f"frame {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, eroded "
-            "by 2 pixels), received none; leave the frame out or check its silhouette"
+            f"photograph {pair.name!r}: expected object pixels (silhouette coverage >= 0.5, "
+            "eroded by 2 pixels), received none; leave the photograph out or check its "
+            "silhouette"
         )
     sums = _sums(pair, counted, exposure)
     n = int(counted.sum())
-    return FrameMetrics(
+    return ImageMetrics(
         name=pair.name,
         psnr_ldr=psnr_of_mean_square(sums["ldr"] / (3 * n)),
         psnr_hdr=psnr_of_mean_square(sums["hdr"] / (3 * n)),
@@ -348,8 +350,8 @@ def measure_frame(pair: FramePair, exposure: float) -> FrameMetrics:
     )
 
 
-def _sums(pair: FramePair, counted: NDArray[np.bool_], exposure: float) -> dict[str, Any]:
-    """Sums over the pixels that count: squared errors, SSIM, FLIP, and both pictures."""
+def _sums(pair: ImagePair, counted: NDArray[np.bool_], exposure: float) -> dict[str, Any]:
+    """Sums over the pixels that count: squared errors, SSIM, FLIP, and both images."""
     sums: dict[str, Any] = dict.fromkeys(("ldr", "hdr", "ssim", "flip"), 0.0)
     sums["colours"] = np.zeros((2, 3))
     for own, wide, inner in strips(*counted.shape):
@@ -369,8 +371,8 @@ def _sums(pair: FramePair, counted: NDArray[np.bool_], exposure: float) -> dict[
     return sums
 
 
-def flip_errors(pair: FramePair, exposure: float) -> NDArray[np.float32]:
-    """FLIP error of each pixel of a frame, (h, w) float32; 0 where the object is not near."""
+def flip_errors(pair: ImagePair, exposure: float) -> NDArray[np.float32]:
+    """FLIP error of each pixel, (h, w) float32; 0 where the object is not near."""
     covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
     errors = np.zeros(covered.shape, np.float32)
     for own, wide, inner in strips(*covered.shape):
@@ -380,13 +382,13 @@ def flip_errors(pair: FramePair, exposure: float) -> NDArray[np.float32]:
     return errors
 
 
-def check_pair(pair: FramePair) -> None:
+def check_pair(pair: ImagePair) -> None:
     """Demand equal sizes and finite values.
 
     Raises
     ------
     ShapeError
-        If photograph, relit picture and silhouette differ in size.
+        If photograph, rendered image and silhouette differ in size.
     InputError
         If a value where coverage >= 0.5 is not finite. Values elsewhere are never
         read and may be anything.
@@ -395,20 +397,20 @@ def check_pair(pair: FramePair) -> None:
     for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
         if len(size) != 2 or np.shape(image) != (*size, 3):
             raise ShapeError(
-                f"frame {pair.name!r}, {what}: expected shape (h, w, 3) with the size of the "
-                f"silhouette, received {np.shape(image)} and silhouette {size}"
+                f"photograph {pair.name!r}, {what}: expected shape (h, w, 3) with the size "
+                f"of the silhouette, received {np.shape(image)} and silhouette {size}"
             )
     covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
     for what, image in (("photograph", pair.photograph), ("relit", pair.relit)):
         _check_finite(pair.name, what, image, covered)
 
 
-def without_backdrop(pair: FramePair, rows: slice = slice(None)) -> tuple[Image, Image]:
-    """Photograph and relit picture (some rows) as float64, black where coverage < 0.5.
+def without_backdrop(pair: ImagePair, rows: slice = slice(None)) -> tuple[Image, Image]:
+    """Photograph and rendered image (some rows) as float64, black where coverage < 0.5.
 
     SSIM and FLIP look at neighbourhoods; a backdrop that the field cannot know
     must not enter them from outside the silhouette. Nor must a saturated highlight: where
-    pixels are excluded, the relit picture is equal to the photograph.
+    pixels are excluded, the rendered image is equal to the photograph.
     """
     covered = (np.asarray(pair.silhouette)[rows] >= COVERAGE_OF_OBJECT)[..., None]
     photograph, relit = (
@@ -420,7 +422,7 @@ def without_backdrop(pair: FramePair, rows: slice = slice(None)) -> tuple[Image,
     return photograph, relit
 
 
-def _checked(pairs: Iterable[FramePair]) -> Iterator[FramePair]:
+def _checked(pairs: Iterable[ImagePair]) -> Iterator[ImagePair]:
     for pair in pairs:
         check_pair(pair)
         yield pair
@@ -433,16 +435,16 @@ def _check_finite(
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise InputError(
-            f"frame {name!r}, {what}: expected finite radiance on the object, received "
+            f"photograph {name!r}, {what}: expected finite radiance on the object, received "
             f"{np.asarray(image)[row, column].tolist()} at row {row}, column {column} "
-            f"({int(bad.sum())} such pixels); repair the picture or leave the frame out"
+            f"({int(bad.sum())} such pixels); repair the image or leave the photograph out"
         )
 
 
 def _colour_ratio(
     photograph: NDArray[np.float64], relit: NDArray[np.float64]
 ) -> tuple[float | None, float | None, float | None]:
-    """Of the sums (3,) of both pictures."""
+    """Of the sums (3,) of both images."""
     red, green, blue = (
         float(got / want) if want > 0.0 else None
         for want, got in zip(photograph, relit, strict=True)
@@ -450,12 +452,12 @@ def _colour_ratio(
     return red, green, blue
 
 
-def worst_to_best(frames: Sequence[FrameMetrics]) -> list[FrameMetrics]:
-    """Frames by falling FLIP error, ties by name.
+def worst_to_best(frames: Sequence[ImageMetrics]) -> list[ImageMetrics]:
+    """Photographs by falling FLIP error, ties by name.
 
     Examples
     --------
-    >>> make = lambda name, flip: FrameMetrics(name, 30, 30, 0.9, flip, 9, (1, 1, 1))
+    >>> make = lambda name, flip: ImageMetrics(name, 30, 30, 0.9, flip, 9, (1, 1, 1))
     >>> [f.name for f in worst_to_best([make("a", 0.1), make("b", 0.3)])]
     ['b', 'a']
     """

@@ -65,7 +65,7 @@ class TruthView:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The truth of a simulated capture; pictures and views are read on demand.
+    """The truth of a simulated capture; images and views are read on demand.
 
     Attributes
     ----------

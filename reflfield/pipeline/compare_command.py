@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from reflfield.capture.capture import Capture
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.mesh import Mesh
-from reflfield.metrics.comparison_silhouettes import write_frame_silhouettes
+from reflfield.metrics.comparison_silhouettes import write_comparison_silhouettes
 from reflfield.metrics.held_out_photographs import RelitPairs, compare_with_photographs
 from reflfield.metrics.image_metrics import Comparison, metrics_text
 from reflfield.pipeline.relight_command import _pictures, check_kept
@@ -48,7 +48,7 @@ def write_standalone_comparison(
     pages = [out / "metrics.json", out / "report" / "index.html"]
     check_kept(frames, [*pages, *_pictures(frames, out / "relit")])
     with TemporaryDirectory() as scratch, filling(out) as partial:
-        silhouettes = write_frame_silhouettes(
+        silhouettes = write_comparison_silhouettes(
             frames, frames, Mesh(field.positions, field.faces), Path(scratch), options.workers
         )
         comparison = compare_with_photographs(
@@ -66,7 +66,7 @@ def _page(field: ReflectanceField, comparison: Comparison, pairs: RelitPairs) ->
         subtitle=f"{len(pairs)} frames",
         key_numbers=sections.key_numbers(comparison),
         sections=(
-            sections.frames_section(
+            sections.held_out_section(
                 comparison,
                 pairs,
                 title="Frames",

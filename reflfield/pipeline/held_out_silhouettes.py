@@ -7,9 +7,9 @@ from typing import Any
 
 from reflfield.capture.capture import Capture
 from reflfield.metrics.comparison_silhouettes import (
-    FrameSilhouettes,
+    ComparisonSilhouettes,
     open_frame_silhouettes,
-    write_frame_silhouettes,
+    write_comparison_silhouettes,
 )
 from reflfield.pipeline.compared_photographs import around, frame_sets
 from reflfield.pipeline.context import Job
@@ -22,7 +22,7 @@ def write_silhouettes_of_frames(job: Job, folder: Path) -> dict[str, Any]:
     """Silhouettes of all views that are compared, once for all fields."""
     origins: list[str] = []
     for name, frames in frame_sets(job).items():
-        made = write_frame_silhouettes(
+        made = write_comparison_silhouettes(
             frames, around(job, name), job.hull_mesh, folder / name, job.resources.workers
         )
         origins += made.origins
@@ -40,6 +40,6 @@ def silhouettes_digests(job: Job) -> dict[str, str]:
     return digests
 
 
-def silhouettes_of_frames(job: Job, name: str, frames: Capture) -> FrameSilhouettes:
+def silhouettes_of_frames(job: Job, name: str, frames: Capture) -> ComparisonSilhouettes:
     """Silhouettes of a set of frames, as their stage has made them."""
     return open_frame_silhouettes(job.stages.root / SILHOUETTES / name, frames)

@@ -9,7 +9,7 @@ from pathlib import Path
 from reflfield.capture.capture import Capture
 from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
-from reflfield.render.relit_photographs import relight_frames
+from reflfield.render.relit_photographs import relight_photographs
 from reflfield.render.renderer import RenderOptions
 from reflfield.util.files import filling
 
@@ -40,7 +40,7 @@ def write_relit_frames(
     """
     check_kept(frames, _pictures(frames, out))
     with filling(out) as partial:
-        made = [frame.exr for frame in relight_frames(field, frames, partial, options)]
+        made = [frame.exr for frame in relight_photographs(field, frames, partial, options)]
     return [out / path.name for path in made]
 
 

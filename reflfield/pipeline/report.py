@@ -183,7 +183,7 @@ def _frames_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterat
         measured = compared[name]
         if measured is not None:
             title, intro = FRAME_TITLES[name]
-            yield sections.frames_section(measured, pairs, title=title, intro=intro)
+            yield sections.held_out_section(measured, pairs, title=title, intro=intro)
 
 
 def _ablation_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterator[Section]:

@@ -1,4 +1,4 @@
-"""Frames relit: each with its own camera and its own light."""
+"""Photographs relit: each with its own camera and its own light."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from reflfield.util.progress import track
 
 
 @dataclass(frozen=True)
-class RelitFrame:
-    """One relit frame.
+class RelitImage:
+    """One relit photograph.
 
     Parameters
     ----------
     name : str
         The photograph's file stem.
     rendering : Rendering
-        Picture and coverage.
+        Image and coverage.
     exr, png : Path
         Files: linear radiance (channels R, G, B and coverage as A), and the
-        picture at the common exposure. The PNG is written after the last frame.
+        image at the common exposure. The PNG is written after the last photograph.
     """
 
     name: str
@@ -39,15 +39,15 @@ class RelitFrame:
     png: Path
 
 
-def relight_frames(
+def relight_photographs(
     field: ReflectanceField,
     frames: Capture,
     out_dir: Path | str,
     options: RenderOptions | None = None,
     *,
     exposure: float | None = None,
-) -> Iterator[RelitFrame]:
-    """Relight every frame of a capture and write NAME.exr and NAME.png.
+) -> Iterator[RelitImage]:
+    """Relight every photograph of a capture and write NAME.exr and NAME.png.
 
     Parameters
     ----------
@@ -63,18 +63,18 @@ def relight_frames(
     exposure : float, optional
         Factor before the sRGB encoding of the PNGs. By default one for all
         frames: 1 / the 99.5th percentile of the luminance of the object's pixels over
-        all frames, so frames can be compared by eye.
+        all photographs, so images can be compared by eye.
 
     Yields
     ------
-    RelitFrame
-        In the order of the frames. Their PNGs are written when the last one
+    RelitImage
+        In the order of the photographs. Their PNGs are written when the last one
         has been taken, because their common exposure is known only then.
 
     Raises
     ------
     InputError
-        If two frames have one name, or a light is unknown.
+        If two photographs have one name, or a light is unknown.
     """
     _check_names(frames)
     folder = Path(out_dir)
@@ -85,7 +85,7 @@ def relight_frames(
     for photograph in track(frames.photographs, total, "relighting"):
         camera, light = frames.cameras[photograph.camera], frames.lights[photograph.light]
         rendering = renderer.render(camera, light)
-        frame = RelitFrame(
+        frame = RelitImage(
             photograph.name,
             rendering,
             folder / f"{photograph.name}.exr",
@@ -110,7 +110,7 @@ def _check_names(frames: Capture) -> None:
         name = photograph.name
         if name in seen:
             raise InputError(
-                f"frames: expected one frame of each name, received {name!r} twice; "
+                f"frames: expected one photograph of each name, received {name!r} twice; "
                 "the second would overwrite the first"
             )
         if Path(name).name != name:

@@ -1,6 +1,6 @@
-"""Pictures of a reflectance field from any camera under any light.
+"""Images of a reflectance field from any camera under any light.
 
-A picture is made by blocks of pixels: rays through a regular grid inside each
+An image is made by blocks of pixels: rays through a regular grid inside each
 pixel, first hits on the base mesh, the bilinear texels of each hit, and the samples of
 those texels towards camera and light. Lights near enough to be points, far ones
 and spots are evaluated exactly; environment maps as a set of directional lights
@@ -58,7 +58,7 @@ RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How pictures are made.
+    """How images are made.
 
     Parameters
     ----------
@@ -69,9 +69,9 @@ class RenderOptions:
         Directional lights that stand for an environment map, 1 to 16384.
     block_pixels : int
         Pixels worked on together by one thread, 1 to 1048576. Memory grows with it; the
-        picture does not depend on it.
+        image does not depend on it.
     workers : int
-        Threads, at most 1024; 0 takes one for each processor core. The picture does not
+        Threads, at most 1024; 0 takes one for each processor core. The image does not
         depend on it.
     ray_offset : float
         Height at which shadow rays start, in diagonals of the mesh, 0 to 0.1.
@@ -104,7 +104,7 @@ class RenderOptions:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A picture of the object alone.
+    """An image of the object alone.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def render(
     lights: Lighting,
     options: RenderOptions | None = None,
 ) -> Rendering:
-    """Make one picture; for several, a `Renderer` shares what they have in common.
+    """Make one image; for several, a `Renderer` shares what they have in common.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def render(
 
 
 class Renderer:
-    """Makes pictures of one field.
+    """Makes images of one field.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class Renderer:
         _ = (field.node_table, field.component_weights, field.local_from_world)
 
     def render(self, camera: Camera, lights: Lighting) -> Rendering:
-        """Make one picture.
+        """Make one image.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""A turntable: cameras on a circle around the object, pictures, animation, contact sheet."""
+"""A turntable: cameras on a circle around the object, images, animation, contact sheet."""
 
 from __future__ import annotations
 
@@ -230,14 +230,14 @@ def write_animation(
 def contact_sheet(
     pictures: Sequence[NDArray[np.uint8]], largest_width: int = 1600
 ) -> NDArray[np.uint8]:
-    """All pictures in rows of about equal width and height.
+    """All images in rows of about equal width and height.
 
     Parameters
     ----------
     pictures : sequence of (h, w, 3) uint8
-        Pictures of one size.
+        Images of one size.
     largest_width : int
-        Pictures are averaged down by a whole factor until the sheet is no wider.
+        Images are averaged down by a whole factor until the sheet is no wider.
 
     Returns
     -------

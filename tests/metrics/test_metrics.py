@@ -19,10 +19,10 @@ from reflfield.errors import InputError, ShapeError
 from reflfield.metrics.image_errors import PIXELS_PER_DEGREE, PSNR_CAP_DB
 from reflfield.metrics.image_metrics import (
     Comparison,
-    FramePair,
+    ImagePair,
     NothingToMeasure,
     common_exposure,
-    compare_frames,
+    compare_images,
     flip_errors,
 )
 from reflfield.render.exposure import ThinnedValues, display, object_pixels
@@ -41,7 +41,7 @@ def frames(rng):
         silhouette = disk(40, 13 + 2 * i)
         photograph = rng.uniform(0.05, 1.5, (40, 40, 3)) * silhouette[..., None]
         relit = photograph * [1.05, 0.95, 1.0] + rng.normal(0, 0.02, photograph.shape)
-        pairs.append(FramePair(f"frame_{i}", photograph, relit, silhouette))
+        pairs.append(ImagePair(f"frame_{i}", photograph, relit, silhouette))
     return pairs
 
 
@@ -51,7 +51,7 @@ def frames(rng):
 def test_constant_error_gives_the_psnr_worked_out_by_hand():
     """Percentile 0.5, so e = 2; HDR error 2 * 0.05 = 0.1 is 20 dB."""
     photograph = np.full((20, 20, 3), 0.5)
-    result = compare_frames([FramePair("a", photograph, photograph - 0.05, np.ones((20, 20)))])
+    result = compare_images([ImagePair("a", photograph, photograph - 0.05, np.ones((20, 20)))])
     assert result.exposure == pytest.approx(2.0, rel=1e-12)
     assert result.frames[0].psnr_hdr == pytest.approx(20.0, abs=1e-9)
     # LDR: sRGB(1) = 1 against sRGB(0.9) = 1.055 * 0.9^(1/2.4) - 0.055.
@@ -62,7 +62,7 @@ def test_constant_error_gives_the_psnr_worked_out_by_hand():
 
 def test_overexposure_counts_in_hdr_only():
     photograph = np.ones((20, 20, 3))
-    frame = compare_frames([FramePair("a", photograph, 3 * photograph, np.ones((20, 20)))])
+    frame = compare_images([ImagePair("a", photograph, 3 * photograph, np.ones((20, 20)))])
     assert frame.mean["psnr_ldr"] == PSNR_CAP_DB
     assert frame.mean["psnr_hdr"] == pytest.approx(-20 * math.log10(2), abs=1e-9)
 
@@ -88,7 +88,7 @@ def test_erosion_keeps_what_is_farther_than_two_pixels_from_the_outside(rng):
 
 @pytest.mark.reference
 def test_ssim_and_flip_are_those_of_their_packages(frames):
-    result = compare_frames(frames)
+    result = compare_images(frames)
     for pair, got in zip(frames, result.frames, strict=True):
         counted = object_pixels(pair.silhouette)
         covered = (pair.silhouette >= 0.5)[..., None]
@@ -109,15 +109,15 @@ def test_ssim_and_flip_are_those_of_their_packages(frames):
 
 
 def test_equal_pictures_are_perfect_and_the_file_stays_valid(frames):
-    same = [FramePair(p.name, p.photograph, p.photograph, p.silhouette) for p in frames]
-    mean = json.loads(compare_frames(same).to_json())["mean"]
+    same = [ImagePair(p.name, p.photograph, p.photograph, p.silhouette) for p in frames]
+    mean = json.loads(compare_images(same).to_json())["mean"]
     assert mean["psnr_ldr"] == mean["psnr_hdr"] == PSNR_CAP_DB
     assert mean["ssim"] == pytest.approx(1, abs=1e-12)
     assert mean["flip"] == 0
 
 
 def test_file_holds_exactly_what_is_promised(frames):
-    content = json.loads(compare_frames(frames).to_json())
+    content = json.loads(compare_images(frames).to_json())
     keys = {"name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
     assert set(content) == {"frames", "mean", "measured", "extra"}
     assert all(
@@ -145,12 +145,12 @@ def test_file_holds_exactly_what_is_promised(frames):
 def test_a_common_scale_changes_nothing(exponent):
     rng = np.random.default_rng(3)
     photograph = rng.uniform(0.01, 1, (24, 24, 3))
-    pair = FramePair("a", photograph, photograph * 0.9, disk(24, 10))
+    pair = ImagePair("a", photograph, photograph * 0.9, disk(24, 10))
     # Powers of two: the products are the same to the last bit.
-    scaled = FramePair(
+    scaled = ImagePair(
         "a", *(x * 2.0**exponent for x in (photograph, pair.relit)), disk(24, 10)
     )
-    a, b = compare_frames([pair]), compare_frames([scaled])
+    a, b = compare_images([pair]), compare_images([scaled])
     assert a.frames == b.frames
     assert a.exposure == b.exposure * 2.0**exponent
 
@@ -160,17 +160,17 @@ def test_backdrop_does_not_matter(frames, rng):
         outside = (pair.silhouette < 0.5)[..., None]
         noise = rng.uniform(0, 5, pair.photograph.shape)
         noise[0, 0] = np.nan
-        return FramePair(
+        return ImagePair(
             pair.name, np.where(outside, noise, pair.photograph), pair.relit, pair.silhouette
         )
 
-    assert compare_frames(map(with_backdrop, frames)) == compare_frames(frames)
+    assert compare_images(map(with_backdrop, frames)) == compare_images(frames)
 
 
 def test_iterators_sequences_and_known_exposure_agree(frames):
-    expected = compare_frames(frames)
-    assert compare_frames(iter(frames)) == expected
-    assert compare_frames(iter(frames), exposure=expected.exposure) == expected
+    expected = compare_images(frames)
+    assert compare_images(iter(frames)) == expected
+    assert compare_images(iter(frames), exposure=expected.exposure) == expected
 
 
 def test_frames_can_be_read_one_at_a_time(frames):
@@ -183,7 +183,7 @@ def test_frames_can_be_read_one_at_a_time(frames):
                 yield pair
 
     source = OnDemand()
-    assert compare_frames(source) == compare_frames(frames)
+    assert compare_images(source) == compare_images(frames)
     assert source.read == 2 * len(frames)
 
 
@@ -193,7 +193,7 @@ def test_frames_can_be_read_one_at_a_time(frames):
 @pytest.mark.stability
 def test_black_photographs_are_measured_with_a_warning():
     black = np.zeros((16, 16, 3))
-    result = compare_frames([FramePair("a", black, black + 0.1, np.ones((16, 16)))])
+    result = compare_images([ImagePair("a", black, black + 0.1, np.ones((16, 16)))])
     assert result.exposure == 1
     assert "black" in result.warnings[0]
     assert result.frames[0].psnr_hdr == pytest.approx(20, abs=1e-9)
@@ -208,7 +208,7 @@ def test_huge_radiance_stays_finite(dtype, rng):
     photograph = rng.uniform(0, 1, (16, 16, 3)).astype(dtype)
     photograph[8, 8] = 1
     photograph *= dtype(min(top, 1e100))
-    result = compare_frames([FramePair("a", photograph, photograph / 2, np.ones((16, 16)))])
+    result = compare_images([ImagePair("a", photograph, photograph / 2, np.ones((16, 16)))])
     assert all(math.isfinite(v) for v in json.loads(result.to_json())["mean"].values())
 
 
@@ -216,7 +216,7 @@ def test_huge_radiance_stays_finite(dtype, rng):
 def test_one_firefly_does_not_set_the_exposure():
     photograph = np.full((60, 60, 3), 0.5)
     photograph[30, 30] = 1e6
-    result = compare_frames([FramePair("a", photograph, photograph, np.ones((60, 60)))])
+    result = compare_images([ImagePair("a", photograph, photograph, np.ones((60, 60)))])
     assert result.exposure == pytest.approx(2, rel=1e-9)
 
 
@@ -224,7 +224,7 @@ def test_one_firefly_does_not_set_the_exposure():
 @pytest.mark.parametrize("size", [5, 6, 7])
 def test_smallest_pictures_that_have_object_pixels(size, rng):
     photograph = rng.uniform(size=(size, size, 3))
-    result = compare_frames([FramePair("a", photograph, photograph, np.ones((size, size)))])
+    result = compare_images([ImagePair("a", photograph, photograph, np.ones((size, size)))])
     assert result.frames[0].n_pixels == (size - 4) ** 2
     assert result.frames[0].ssim == pytest.approx(1, abs=1e-12)
 
@@ -234,21 +234,21 @@ def test_smallest_pictures_that_have_object_pixels(size, rng):
 def test_values_that_are_not_finite_are_refused_by_name(frames, what, value):
     pictures = {"photograph": frames[1].photograph.copy(), "relit": frames[1].relit.copy()}
     pictures[what][20, 21, 2] = value
-    bad = FramePair("dome/v07_l11", silhouette=frames[1].silhouette, **pictures)
+    bad = ImagePair("dome/v07_l11", silhouette=frames[1].silhouette, **pictures)
     with pytest.raises(InputError, match=rf"dome/v07_l11.*{what}.*row 20, column 21"):
-        compare_frames([frames[0], bad])
+        compare_images([frames[0], bad])
 
 
 def test_a_frame_without_object_is_left_out_by_name(frames):
-    empty = FramePair("left_out", frames[0].photograph, frames[0].relit, np.zeros((40, 40)))
-    result = compare_frames([frames[0], empty])
+    empty = ImagePair("left_out", frames[0].photograph, frames[0].relit, np.zeros((40, 40)))
+    result = compare_images([frames[0], empty])
     assert result.not_measured == ("left_out",)
-    assert result.frames == compare_frames([frames[0]]).frames
+    assert result.frames == compare_images([frames[0]]).frames
     assert json.loads(result.to_json())["measured"]["frames_not_measured"] == ["left_out"]
     with pytest.raises(NothingToMeasure, match="object pixel"):
-        compare_frames([empty])
+        compare_images([empty])
     with pytest.raises(NothingToMeasure, match="left_out have none"):
-        compare_frames([empty], exposure=1.0)
+        compare_images([empty], exposure=1.0)
 
 
 def test_saturated_pixels_are_not_counted_and_change_nothing_else(frames):
@@ -261,9 +261,9 @@ def test_saturated_pixels_are_not_counted_and_change_nothing_else(frames):
     for bright in (1.0, 50.0):
         relit = np.where(saturated[..., None], bright * b.photograph, b.relit)
         pair = replace(b, relit=relit, excluded=saturated)
-        results.append(compare_frames([a, pair], exposure=0.5).frames[1])
+        results.append(compare_images([a, pair], exposure=0.5).frames[1])
     assert results[0] == results[1]
-    plain = compare_frames([a, b], exposure=0.5).frames[1]
+    plain = compare_images([a, b], exposure=0.5).frames[1]
     counted = object_pixels(b.silhouette) & ~saturated
     n = int((object_pixels(b.silhouette) & saturated).sum())
     assert n == 9
@@ -275,25 +275,25 @@ def test_saturated_pixels_are_not_counted_and_change_nothing_else(frames):
 
 def test_without_saturated_pixels_nothing_changes(frames):
     none = [replace(pair, excluded=np.zeros((40, 40), bool)) for pair in frames]
-    assert compare_frames(none) == compare_frames(frames)
+    assert compare_images(none) == compare_images(frames)
 
 
 def test_metrics_come_back_from_their_file(frames):
-    result = compare_frames(frames)
+    result = compare_images(frames)
     assert Comparison.from_dict(json.loads(result.to_json())) == result
 
 
 def test_sizes_that_differ_are_refused_by_name(frames):
-    small = FramePair("v3", frames[0].photograph, frames[0].relit[:39], frames[0].silhouette)
+    small = ImagePair("v3", frames[0].photograph, frames[0].relit[:39], frames[0].silhouette)
     with pytest.raises(ShapeError, match=r"v3.*relit.*\(39, 40, 3\)"):
-        compare_frames([small])
+        compare_images([small])
 
 
 def test_no_frame_is_refused():
-    with pytest.raises(InputError, match="at least one frame"):
-        compare_frames([], exposure=1.0)
+    with pytest.raises(InputError, match="at least one photograph"):
+        compare_images([], exposure=1.0)
     with pytest.raises(InputError, match="at least one"):
-        compare_frames([])
+        compare_images([])
 
 
 def test_strips_measure_what_whole_frames_do(frames, monkeypatch, rng):
@@ -308,9 +308,9 @@ def test_strips_measure_what_whole_frames_do(frames, monkeypatch, rng):
         )
         for pair in frames
     ]
-    whole, errors = compare_frames(tall), flip_errors(tall[0], 1.0)
+    whole, errors = compare_images(tall), flip_errors(tall[0], 1.0)
     monkeypatch.setattr("reflfield.metrics.image_errors.PIXELS_AT_ONCE", 1)
-    by_strips = compare_frames(tall)
+    by_strips = compare_images(tall)
     for name in ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"):
         # FLIP is single precision, its filters' sums begin elsewhere.
         assert by_strips.mean[name] == pytest.approx(whole.mean[name], rel=1e-5)
@@ -331,7 +331,7 @@ COMPARES_LARGE_FRAMES = """
 import resource
 import numpy as np
 from reflfield.metrics import image_errors
-from reflfield.metrics.image_metrics import FramePair, compare_frames
+from reflfield.metrics.image_metrics import ImagePair, compare_images
 
 SIZE = 900
 image_errors.PIXELS_AT_ONCE = 1 << 17
@@ -342,7 +342,7 @@ class Frames:
         for i in range(1):
             picture = np.full((SIZE, SIZE, 3), 0.5 + 0.1 * i, np.float32)
             picture[::7] = 0.2
-            yield FramePair(str(i), picture, picture * np.float32(0.9),
+            yield ImagePair(str(i), picture, picture * np.float32(0.9),
                             np.ones((SIZE, SIZE), np.float32))
 
 
@@ -351,9 +351,9 @@ def peak():
 
 
 small = np.full((64, 64, 3), 0.5)
-compare_frames([FramePair("s", small, 0.9 * small, np.ones((64, 64)))])
+compare_images([ImagePair("s", small, 0.9 * small, np.ones((64, 64)))])
 before = peak()
-result = compare_frames(Frames())
+result = compare_images(Frames())
 print(peak() - before, result.mean["psnr_hdr"])
 """
 

@@ -12,7 +12,10 @@ from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.readers import open_capture
 from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.metrics.comparison_silhouettes import projected_coverage, write_frame_silhouettes
+from reflfield.metrics.comparison_silhouettes import (
+    projected_coverage,
+    write_comparison_silhouettes,
+)
 from reflfield.options import HoldOut
 from reflfield.pipeline.hold_out import split_of
 from reflfield.render.exposure import object_pixels
@@ -52,7 +55,7 @@ def frames_of(capture, hold_out):
 
 
 def made(capture, frames, hull, folder):
-    return write_frame_silhouettes(frames, capture, hull, folder, threads=1)
+    return write_comparison_silhouettes(frames, capture, hull, folder, threads=1)
 
 
 class TestWhereTheyComeFrom:

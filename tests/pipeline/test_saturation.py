@@ -19,7 +19,7 @@ from reflfield.observations import image_projection
 from reflfield.options import HoldOut, with_tables
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import run
-from reflfield.render.relit_photographs import relight_frames
+from reflfield.render.relit_photographs import relight_photographs
 
 # Matt, so that what is clipped under one light is not under another.
 SCENE = {
@@ -80,7 +80,7 @@ def error_of(clipped, exposed, tiny_options, folder):
     job = run(clipped, folder, options, hold_out=HoldOut(views=1, lights=1), last="compression")
     frames, unclipped = job.held_frames, open_capture(exposed)
     field, squares = open_field(folder / "field.rfld"), []
-    for _ in relight_frames(field, frames, folder / "relit"):
+    for _ in relight_photographs(field, frames, folder / "relit"):
         pass
     for photograph in frames.photographs:
         index = [p.name for p in unclipped.photographs].index(photograph.name)

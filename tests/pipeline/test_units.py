@@ -14,7 +14,7 @@ from reflfield.field.file import open_field
 from reflfield.options import HoldOut, with_tables
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import run
-from reflfield.render.relit_photographs import relight_frames
+from reflfield.render.relit_photographs import relight_photographs
 
 # East, north and height of a survey, metres.
 SURVEY = (4.4e5, 1e7, 2345.0)
@@ -49,7 +49,7 @@ def pictures(tiny_capture, tiny_options, tmp_path_factory):
         out = folder / "out"
         run(capture, out, options, hold_out=HoldOut(views=1, lights=1), last="compression")
         frames = capture.subset([0, 5], [1, 3])
-        for _ in relight_frames(open_field(out / "field.rfld"), frames, folder / "relit"):
+        for _ in relight_photographs(open_field(out / "field.rfld"), frames, folder / "relit"):
             pass
         names = [photograph.name for photograph in frames.photographs]
         return np.stack([read_image(folder / "relit" / f"{name}.exr") for name in names])

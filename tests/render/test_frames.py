@@ -11,7 +11,7 @@ from reflfield.capture.image_files import read_coverage, read_image
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.render.exposure import ExposureMeter
-from reflfield.render.relit_photographs import relight_frames
+from reflfield.render.relit_photographs import relight_photographs
 from reflfield.render.renderer import RenderOptions, render
 from reflfield.render.turntable import OrbitOptions, orbit_cameras, render_orbit
 from reflfield.util.progress import listening
@@ -40,7 +40,7 @@ def frames_of(field, names=("a", "b.1", "c")):
 
 def test_each_frame_has_its_own_camera_and_light(field, tmp_path):
     frames = frames_of(field)
-    relit = list(relight_frames(field, frames, tmp_path / "out", FAST))
+    relit = list(relight_photographs(field, frames, tmp_path / "out", FAST))
     assert [frame.name for frame in relit] == ["a", "b.1", "c"]
     for frame, photograph in zip(relit, frames.photographs, strict=True):
         camera, light = frames.cameras[photograph.camera], frames.lights[photograph.light]
@@ -53,7 +53,7 @@ def test_each_frame_has_its_own_camera_and_light(field, tmp_path):
 
 
 def test_pictures_share_one_exposure(field, tmp_path):
-    relit = list(relight_frames(field, frames_of(field), tmp_path, FAST))
+    relit = list(relight_photographs(field, frames_of(field), tmp_path, FAST))
     meter = ExposureMeter()
     for frame in relit:
         meter.add(frame.rendering.image, frame.rendering.coverage)
@@ -64,23 +64,23 @@ def test_pictures_share_one_exposure(field, tmp_path):
         # Half a step of 8 bits times the steepest slope of the sRGB decoding, 2.28.
         assert np.abs(decoded - wanted).max() < 0.5 / 255 * 2.3
     brightest = read_image(relit[0].png).max()
-    list(relight_frames(field, frames_of(field), tmp_path, FAST, exposure=exposure / 4))
+    list(relight_photographs(field, frames_of(field), tmp_path, FAST, exposure=exposure / 4))
     assert read_image(relit[0].png).max() < 0.5 * brightest
 
 
 def test_same_frames_give_the_same_bytes(field, tmp_path):
     for folder, workers in (("one", 1), ("two", 2)):
         options = RenderOptions(workers=workers, samples_per_pixel=4)
-        list(relight_frames(field, frames_of(field), tmp_path / folder, options))
+        list(relight_photographs(field, frames_of(field), tmp_path / folder, options))
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
 def test_names_that_collide_or_leave_the_folder_are_refused(field, tmp_path):
     with pytest.raises(InputError, match="received 'a' twice"):
-        next(relight_frames(field, frames_of(field, ("a", "a")), tmp_path / "x"))
+        next(relight_photographs(field, frames_of(field, ("a", "a")), tmp_path / "x"))
     with pytest.raises(InputError, match="without folders"):
-        next(relight_frames(field, frames_of(field, ("../a",)), tmp_path / "x"))
+        next(relight_photographs(field, frames_of(field, ("../a",)), tmp_path / "x"))
     assert not (tmp_path / "x").exists()
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from reflfield.metrics.completion_error import CompletionError
 from reflfield.metrics.frame_errors import FrameErrors
 from reflfield.metrics.hull_distance import HullDistance
-from reflfield.metrics.image_metrics import FramePair, compare_frames
+from reflfield.metrics.image_metrics import ImagePair, compare_images
 from reflfield.report import sections
 from reflfield.report.page import ReportContent
 
@@ -38,7 +38,7 @@ def frame_pairs(rng, count=10, size=64, prefix="heldout_"):
         light = np.array([np.cos(i), np.sin(i), 1.5]) / np.sqrt(3.25)
         photograph, silhouette = shaded_ball(size, light)
         relit, _ = shaded_ball(size, light, rng, noise=0.01 * (i + 1))
-        pairs.append(FramePair(f"{prefix}{i:03d}", photograph, relit, silhouette))
+        pairs.append(ImagePair(f"{prefix}{i:03d}", photograph, relit, silhouette))
     return pairs
 
 
@@ -55,7 +55,7 @@ def atlas(side=64):
 
 def full_content(rng, title="vase", prefix="heldout_"):
     pairs = frame_pairs(rng, prefix=prefix)
-    comparison = compare_frames(pairs)
+    comparison = compare_images(pairs)
     texels, charts = atlas()
     n = len(charts)
     base = Rotation.random(n, random_state=rng).as_matrix()
@@ -83,7 +83,7 @@ def full_content(rng, title="vase", prefix="heldout_"):
             comparison, file_bytes=812_000, raw_bytes=4 * 10**8, seconds=143.0
         ),
         sections=(
-            sections.frames_section(comparison, pairs, max_rows=4),
+            sections.held_out_section(comparison, pairs, max_rows=4),
             sections.silhouettes_section(views, origin="simulated"),
             sections.atlas_section(texels, charts, rng.uniform(0, 1, (n, 3)), {"charts": 2}),
             sections.coverage_section(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reflfield.errors import ShapeError
-from reflfield.metrics.image_metrics import compare_frames
+from reflfield.metrics.image_metrics import compare_images
 from reflfield.report import sections
 from reflfield.report.page import (
     ColourBar,
@@ -113,7 +113,7 @@ def test_every_picture_says_its_size_and_what_it_is(page):
 def test_same_content_gives_same_bytes(samples):
     def page():
         pairs = samples.frame_pairs(np.random.default_rng(5), count=2, size=24)
-        section = sections.frames_section(compare_frames(pairs), pairs)
+        section = sections.held_out_section(compare_images(pairs), pairs)
         return render_report(ReportContent("vase", sections=(section,)))
 
     assert page() == page()
@@ -127,7 +127,7 @@ def test_names_from_outside_are_escaped(samples):
         pairs = samples.frame_pairs(np.random.default_rng(5), 2, 24, prefix=name)
         view = sections.SilhouetteView(name, pairs[0].photograph, *[pairs[0].silhouette] * 2)
         shown = (
-            sections.frames_section(compare_frames(pairs), pairs),
+            sections.held_out_section(compare_images(pairs), pairs),
             sections.silhouettes_section([view]),
             sections.run_section({name: name}, {}),
         )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reflfield.errors import InputError
-from reflfield.metrics.image_metrics import FramePair, compare_frames
+from reflfield.metrics.image_metrics import ImagePair, compare_images
 from reflfield.report import plots, sections
 from reflfield.report.page import Figure, Note, ReportContent, Table, render_report
 
@@ -17,8 +17,8 @@ def tables(section):
 
 def test_rows_run_from_worst_to_best_and_skip_the_rest(rng, samples):
     pairs = samples.frame_pairs(rng, count=7, size=24)
-    comparison = compare_frames(pairs)
-    section = sections.frames_section(comparison, iter(pairs), max_rows=3)
+    comparison = compare_images(pairs)
+    section = sections.held_out_section(comparison, iter(pairs), max_rows=3)
     titles = [item.title for item in section.items if isinstance(item, Figure) and item.title]
     # Noise grows with the number.
     assert titles == ["heldout_006", "heldout_003", "heldout_000"]
@@ -32,17 +32,17 @@ def test_rows_run_from_worst_to_best_and_skip_the_rest(rng, samples):
 
 def test_frames_of_one_name_stay_apart_and_others_are_refused(rng, samples):
     pairs = samples.frame_pairs(rng, count=2, size=24)
-    same = [FramePair("0001", p.photograph, p.relit, p.silhouette) for p in pairs]
-    comparison = compare_frames(same)
+    same = [ImagePair("0001", p.photograph, p.relit, p.silhouette) for p in pairs]
+    comparison = compare_images(same)
     figures = [
-        i for i in sections.frames_section(comparison, same).items if isinstance(i, Figure)
+        i for i in sections.held_out_section(comparison, same).items if isinstance(i, Figure)
     ]
     # Worst first: the second frame has twice the noise.
     for figure, metrics in zip(figures, comparison.frames[::-1], strict=False):
         assert figure.title == "0001"
         assert f"PSNR {metrics.psnr_ldr:.2f} dB" in figure.caption
     with pytest.raises(InputError, match=r"pairs: expected '0001'.*'heldout_000'"):
-        sections.frames_section(comparison, pairs)
+        sections.held_out_section(comparison, pairs)
 
 
 def test_silhouette_agreement_is_counted():
@@ -71,7 +71,7 @@ def test_compression_ratio_and_shares():
 
 def test_fields_of_other_size_are_not_compared_in_silence(rng, samples):
     pairs = samples.frame_pairs(rng, count=3, size=24)
-    comparison = compare_frames(pairs)
+    comparison = compare_images(pairs)
 
     def section(other_bytes):
         variants = [
@@ -100,9 +100,9 @@ def test_fields_that_were_tried_stand_beside_the_photograph(rng, samples):
     }
     tried = [
         sections.CandidateRun(
-            sections.FieldVariant(name, {"held out": compare_frames(some)}, 1000, 0.1234, 0.05),
+            sections.FieldVariant(name, {"held out": compare_images(some)}, 1000, 0.1234, 0.05),
             seconds=75.0,
-            unseen=None if name == "c" else compare_frames(some).mean,
+            unseen=None if name == "c" else compare_images(some).mean,
         )
         for name, some in frames.items()
     ]
@@ -113,7 +113,7 @@ def test_fields_that_were_tried_stand_beside_the_photograph(rng, samples):
         )
 
     (compared,) = tables(section(3))
-    best = f"{compare_frames(pairs).mean['psnr_ldr']:.2f}"
+    best = f"{compare_images(pairs).mean['psnr_ldr']:.2f}"
     assert [row[0] for row in compared.rows] == ["a", "b", "c"]
     assert compared.rows[1][1] == best
     assert [row[4] for row in compared.rows] == ["0 of 3", "3 of 3", "0 of 3"]
@@ -171,7 +171,7 @@ def test_degenerate_input_still_makes_a_page(rng, samples):
             "empty",
             key_numbers=sections.key_numbers(),
             sections=(
-                sections.frames_section(compare_frames(pair), pair),
+                sections.held_out_section(compare_images(pair), pair),
                 sections.silhouettes_section(
                     [
                         sections.SilhouetteView(

@@ -20,7 +20,7 @@ from reflfield.report.sections.candidate_runs import (
 from reflfield.report.sections.held_out_images import (
     alignment_section,
     comparisons_table,
-    frames_section,
+    held_out_section,
     metrics_table,
 )
 from reflfield.report.sections.run_summary import (
@@ -52,7 +52,7 @@ __all__ = [
     "comparisons_table",
     "compression_section",
     "coverage_section",
-    "frames_section",
+    "held_out_section",
     "key_numbers",
     "metrics_table",
     "normals_section",

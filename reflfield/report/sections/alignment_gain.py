@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reflfield.errors import InputError
-from reflfield.metrics.image_metrics import Comparison, FramePair
+from reflfield.metrics.image_metrics import Comparison, ImagePair
 from reflfield.report.page import (
     ColourBar,
     Figure,
@@ -58,7 +58,7 @@ class FieldVariant:
 
 
 def ablation_section(
-    variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]]
+    variants: Sequence[FieldVariant], pairs: Sequence[Iterable[ImagePair]]
 ) -> Section:
     """What alignment brings: errors of fields with and without it, and one image of each.
 
@@ -66,7 +66,7 @@ def ablation_section(
     ----------
     variants : sequence of FieldVariant
         The field itself first.
-    pairs : sequence of iterable of FramePair
+    pairs : sequence of iterable of ImagePair
         Of each variant, the photographs of its first comparison in that order. May be empty.
 
     Returns
@@ -133,7 +133,7 @@ def _metrics_table(variants: Sequence[FieldVariant]) -> Table:
 
 
 def median_photograph(
-    variants: Sequence[FieldVariant], pairs: Sequence[Iterable[FramePair]], advice: str
+    variants: Sequence[FieldVariant], pairs: Sequence[Iterable[ImagePair]], advice: str
 ) -> Figure:
     """The photograph whose gain in FLIP, first over second, is the median, with all variants.
 
@@ -141,7 +141,7 @@ def median_photograph(
     ----------
     variants : sequence of FieldVariant
         Two at least, with comparisons.
-    pairs : sequence of iterable of FramePair
+    pairs : sequence of iterable of ImagePair
         Of each variant, the photographs of its first comparison in that order.
     advice : str
         What to look at.
@@ -174,6 +174,6 @@ def median_photograph(
     )
 
 
-def _row_of(chosen: int, own_pairs: Iterable[FramePair], comparison: Comparison) -> ComparedRow:
+def _row_of(chosen: int, own_pairs: Iterable[ImagePair], comparison: Comparison) -> ComparedRow:
     pair = next(pair for i, pair in enumerate(own_pairs) if i == chosen)
     return compared_row(pair, comparison.frames[chosen], comparison.exposure)

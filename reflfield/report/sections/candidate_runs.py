@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reflfield.errors import InputError
-from reflfield.metrics.image_metrics import FramePair
+from reflfield.metrics.image_metrics import ImagePair
 from reflfield.report.page import (
     Item,
     Note,
@@ -67,7 +67,7 @@ def candidate_runs_section(
     runs: Sequence[CandidateRun],
     selected: str,
     words: Sequence[str],
-    pairs: Sequence[Iterable[FramePair]],
+    pairs: Sequence[Iterable[ImagePair]],
 ) -> Section:
     """All candidate runs on the photographs that decided, and which was selected.
 
@@ -79,7 +79,7 @@ def candidate_runs_section(
         Name of the field that was selected.
     words : sequence of str
         A sentence for each option that was selected.
-    pairs : sequence of iterable of FramePair
+    pairs : sequence of iterable of ImagePair
         Of each field, the photographs of its comparison in that order.
 
     Returns

@@ -13,8 +13,8 @@ from reflfield.errors import InputError
 from reflfield.metrics.image_errors import PSNR_CAP_DB
 from reflfield.metrics.image_metrics import (
     Comparison,
-    FrameMetrics,
-    FramePair,
+    ImageMetrics,
+    ImagePair,
     flip_errors,
     worst_to_best,
 )
@@ -41,9 +41,9 @@ FLIP_LABEL = "FLIP error, all rows; 0: indistinguishable"
 METRIC_HEADER = ("PSNR LDR, dB", "PSNR HDR, dB", "SSIM", "FLIP")
 
 
-def frames_section(
+def held_out_section(
     comparison: Comparison,
-    pairs: Iterable[FramePair],
+    pairs: Iterable[ImagePair],
     *,
     title: str = "Held-out photographs",
     intro: str = "Photographs that the field was not made of, beside images rendered from it.",
@@ -55,7 +55,7 @@ def frames_section(
     ----------
     comparison : Comparison
         Of the same photographs.
-    pairs : iterable of FramePair
+    pairs : iterable of ImagePair
         In the order of the comparison; read once, one at a time.
     title, intro : str
     max_rows : int
@@ -90,13 +90,13 @@ def frames_section(
 class ComparedRow:
     """One row of the page: encoded images, metrics, and block means of FLIP errors."""
 
-    metrics: FrameMetrics
+    metrics: ImageMetrics
     photograph: Picture
     relit: Picture
     error: NDArray[np.floating]
 
 
-def compared_row(pair: FramePair, metrics: FrameMetrics, exposure: float) -> ComparedRow:
+def compared_row(pair: ImagePair, metrics: ImageMetrics, exposure: float) -> ComparedRow:
     """Crop photograph and image to the object and compute their FLIP errors."""
     if pair.name != metrics.name:
         raise InputError(
@@ -232,7 +232,7 @@ def metric_cells(metrics: Mapping[str, Any]) -> tuple[str, str, str, str]:
     return red, green, blue, last
 
 
-def _even_choice(frames: Sequence[FrameMetrics], count: int) -> list[FrameMetrics]:
+def _even_choice(frames: Sequence[ImageMetrics], count: int) -> list[ImageMetrics]:
     if len(frames) <= count:
         return list(frames)
     ranks = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
