@@ -350,7 +350,7 @@ def inspect(
 
     most_bytes = parse_bytes(max_memory)
     if path.suffix.lower() == ".rfld":
-        from reflfield.field.file import describe as describe_field
+        from reflfield.field.description import describe as describe_field
         from reflfield.field.file import open_field
 
         lines = describe_field(open_field(path, max_bytes=most_bytes)).lines()

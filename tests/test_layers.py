@@ -22,6 +22,7 @@ PACKAGES = (
     "alignment",
     "field",
     "render",
+    "fitting",
     "metrics",
     "export",
     "report",

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from reflfield.errors import InputError
+from reflfield.field.array_schemas import check_arrays, check_indices, node_side
 from reflfield.field.indirect_light import IndirectLight, no_indirect_light
 from reflfield.field.quantisation import (
     SMALLEST_TURN,
@@ -23,14 +24,11 @@ from reflfield.field.quantisation import (
     smallest_codes,
 )
 from reflfield.field.reflectance_field import (
+    ClusteredField,
     Domain,
     LightModel,
-    ReflectanceField,
     Visibility,
-    check_arrays,
-    check_indices,
     check_options,
-    node_side,
 )
 from reflfield.field.tucker_coding import factor_table, unfactor_table
 from reflfield.util.blas_threads import one_core_blas
@@ -140,7 +138,7 @@ def build_field(
     light_model: LightModel = "known",
     metadata: Mapping[str, Any] | None = None,
     quantisation: Quantisation | None = None,
-) -> ReflectanceField:
+) -> ClusteredField:
     """Quantise fitted parts into a field.
 
     Parameters
@@ -161,7 +159,7 @@ def build_field(
 
     Returns
     -------
-    ReflectanceField
+    ClusteredField
 
     Raises
     ------
@@ -195,9 +193,9 @@ def build_field(
     sides = [node_side("mean", n) for n in reflectance.mean.shape[1:3]]
     # Sums of several cores end in other last bits with other numbers of them.
     with one_core_blas():
-        arrays = _surface_arrays(surface) | _reflectance_arrays(reflectance, bits)
+        arrays = surface_arrays(surface) | _reflectance_arrays(reflectance, bits)
     check_arrays({name: (a.dtype.name, a.shape) for name, a in arrays.items()})
-    built = ReflectanceField(
+    built = ClusteredField(
         arrays=arrays,
         view_side=sides[0],
         light_side=sides[1],
@@ -213,7 +211,8 @@ def build_field(
     return built
 
 
-def _surface_arrays(surface: BaseSurface) -> dict[str, NDArray[Any]]:
+def surface_arrays(surface: BaseSurface) -> dict[str, NDArray[Any]]:
+    """Mesh, texture coordinates and texels on lattices."""
     check_finite("positions", surface.positions)
     check_finite("uv", surface.uv)
     check_shape("uv", surface.uv, (len(surface.positions), 2))
@@ -304,16 +303,18 @@ def _reflectance_arrays(
         "cluster": cluster.astype(np.uint8 if len(mean) <= 256 else np.uint16),
         "coefficients": smallest_codes(codes),
         "coefficient_scale": scale,
-        **_indirect_arrays(reflectance, step),
+        **indirect_arrays(reflectance.indirect, len(reflectance.cluster), step),
     }
 
 
-def _indirect_arrays(reflectance: FittedReflectance, step: float) -> dict[str, NDArray[Any]]:
+def indirect_arrays(
+    indirect: IndirectLight | None, n_texels: int, step: float
+) -> dict[str, NDArray[Any]]:
     """Indirect light; its coefficients in steps, as the basis functions are of unit size."""
-    light = reflectance.indirect or no_indirect_light(len(reflectance.cluster))
+    light = indirect or no_indirect_light(n_texels)
     coefficients = np.asarray(light.coefficients, np.float64)
     # The step is a share of the means, which may be far darker.
-    step = max(step, float(np.abs(coefficients).max(initial=0.0)) * FINEST_SHARE)
+    step = max(step, float(np.abs(coefficients).max(initial=0.0)) * FINEST_SHARE) or 1.0
     codes = np.rint(coefficients / step)
     return {
         "indirect_functions": np.ascontiguousarray(light.functions, np.float32),
@@ -357,7 +358,7 @@ def _coefficient_codes(
     return codes, scale
 
 
-def quantisation_error(fitted: FittedReflectance, field: ReflectanceField) -> float:
+def quantisation_error(fitted: FittedReflectance, field: ClusteredField) -> float:
     """Root mean square error of quantisation over texels and nodes, of transformed values.
 
     From the Gram matrices of the functions before and after; no texel's nodes are formed.

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from reflfield.errors import InputError
 from reflfield.factorization import Completion, LocalPCA
 from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.half_vector import HalfVectorOptions
 from reflfield.field.sample_fit import SampleFitOptions
 from reflfield.util.validation import check_ranges
 
@@ -30,12 +31,21 @@ MOST_SAMPLES = 4096
 LEAST_SPREAD = 1e-9
 
 
+# Models of a field.
+CLUSTERED, HALF_VECTOR = "clustered", "half_vector"
+
+
 @dataclass(frozen=True)
 class CompressionOptions:
     """Size of the field and how it is fitted.
 
     Parameters
     ----------
+    model : {"clustered", "half_vector"}
+        "clustered": clustered local PCA in aligned frames, as in the paper. "half_vector":
+        functions of the half vector that all texels share, with coefficients and frames of
+        each texel fitted to the photographs; the lights must be known.
+    half_vector : HalfVectorOptions
     n_clusters, n_components : int
         Clusters, and basis functions of each beside its mean.
     fit : {"auto", "samples", "grid"}
@@ -61,6 +71,8 @@ class CompressionOptions:
         half, quantisation adds some percent to the error; see `Quantisation`.
     """
 
+    model: str = CLUSTERED
+    half_vector: HalfVectorOptions = field(default_factory=HalfVectorOptions)
     n_clusters: int = 8
     n_components: int = 6
     fit: str = "auto"
@@ -72,6 +84,10 @@ class CompressionOptions:
     coarseness: float = 0.5
 
     def __post_init__(self) -> None:
+        if self.model not in (CLUSTERED, HALF_VECTOR):
+            raise InputError(
+                f"model: expected 'clustered' or 'half_vector', received {self.model!r}"
+            )
         if self.fit not in ("auto", "samples", "grid"):
             raise InputError(
                 f"fit: expected 'auto', 'samples' or 'grid', received {self.fit!r}"

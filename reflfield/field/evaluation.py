@@ -1,10 +1,10 @@
 """Samples of a reflectance field: any texel, any view, any light.
 
-Directions are rotated into the texel's frame and interpolated bilinearly on
-the grid of views (4 taps) and of lights (4 taps). A direction below the local
-horizon reads the horizon. The cosine of the light is multiplied to what is
-interpolated (`softened_cosine`): frames follow the data, not the base geometry, so a
-light a few degrees below a texel's horizon may still reach it.
+Of a clustered field, directions are rotated into the texel's frame and interpolated
+bilinearly on the grid of views (4 taps) and of lights (4 taps); of a half-vector field, see
+`field.half_vector`. A direction below the local horizon reads the horizon. The cosine of the
+light is multiplied to what is interpolated (`softened_cosine`): frames follow the data, not
+the base geometry, so a light a few degrees below a texel's horizon may still reach it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.errors import InputError
+from reflfield.field.half_vector import evaluate_half_vector, sum_half_vector_lights
 from reflfield.field.quantisation import check_finite
-from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.field.reflectance_field import (
+    ClusteredField,
+    HalfVectorField,
+    ReflectanceField,
+)
 from reflfield.sphere.hemisphere import first_tap, softened_cosine_of, square_from_xyz
 from reflfield.util.validation import UNIT_TOLERANCE, check_shape
 
@@ -192,12 +197,16 @@ def evaluate(
 
     Notes
     -----
-    16 taps of K + 1 components and 3 channels a sample; no memory beyond the
-    result.
+    16 taps of K + 1 components and 3 channels a sample of a clustered field, 8 taps of K lobes
+    of a half-vector field; no memory beyond the result.
     """
     index, views = _checked(field, texels, "views_world", views_world)
     _, lights = _checked(field, texels, "lights_world", lights_world)
     out = np.zeros((len(index), 3), np.float32)
+    if isinstance(field, HalfVectorField):
+        evaluate_half_vector(*field.half_vector.arrays, index, views, lights, out)
+        return out
+    field = clustered(field)
     _evaluate(
         field.node_table,
         field.component_weights,
@@ -213,14 +222,30 @@ def evaluate(
     return out
 
 
+def clustered(field: ReflectanceField) -> ClusteredField:
+    """Demand a clustered field.
+
+    Raises
+    ------
+    InputError
+        If it is of another model.
+    """
+    if not isinstance(field, ClusteredField):
+        raise InputError(
+            f"field: expected a clustered field, received one of model {field.model!r}; fit "
+            "one with compression.model = 'clustered'"
+        )
+    return field
+
+
 def light_response(
-    field: ReflectanceField, texels: ArrayLike, views_world: ArrayLike
+    field: ClusteredField, texels: ArrayLike, views_world: ArrayLike
 ) -> NDArray[np.float32]:
     """Values at all light nodes, in the domain, for texels seen from given sides.
 
     Parameters
     ----------
-    field : ReflectanceField
+    field : ClusteredField
         Field to read.
     texels : (n,) int
         Texels; -1 gives zero.
@@ -297,11 +322,11 @@ def sum_lights(
 
     Notes
     -----
-    The sum over views is done once for each texel, so a light costs 4 taps
-    of 3 channels whatever K is. Memory is ``n * n_light_nodes * 12`` bytes: pass
+    Of a clustered field the sum over views is done once for each texel, so a light costs 4
+    taps of 3 channels whatever K is. Memory is ``n * field.light_nodes * 12`` bytes: pass
     texels by blocks.
     """
-    index, _ = _checked(field, texels, "views_world", views_world)
+    index, views = _checked(field, texels, "views_world", views_world)
     lights = np.ascontiguousarray(lights_world, np.float32)
     check_shape("lights_world", lights, (None, 3))
     _check_unit("lights_world", lights)
@@ -313,22 +338,35 @@ def sum_lights(
     if lit is not None:
         check_shape("lit", reached, (len(index), len(lights)))
     out = np.zeros((len(index), 3), np.float32)
-    _sum_lights(
-        light_response(field, index, views_world),
-        field.local_from_world,
-        field.light_side,
-        field.inverse_power,
-        index,
-        lights,
-        powers,
-        reached,
-        out,
-    )
+    _add_direct_light(field, index, views, (lights, powers, reached), out)
     if lit is not None and not field.indirect.is_black:
         indirect = field.indirect.under(index, lights, field.inverse_power)
         dark = ~reached & (index >= 0)[:, None]
         out += np.einsum("nmc,mc,nm->nc", indirect, powers, dark, optimize=True)
     return out
+
+
+def _add_direct_light(
+    field: ReflectanceField,
+    index: NDArray[np.int32],
+    views: NDArray[np.float32],
+    lights: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]],
+    out: NDArray[np.float32],
+) -> None:
+    """Add what texels send back of lights: directions, irradiances, which reach them."""
+    if isinstance(field, HalfVectorField):
+        sum_half_vector_lights(*field.half_vector.arrays, index, views, *lights, out)
+        return
+    field = clustered(field)
+    _sum_lights(
+        light_response(field, index, views),
+        field.local_from_world,
+        field.light_side,
+        field.inverse_power,
+        index,
+        *lights,
+        out,
+    )
 
 
 def texel_taps(

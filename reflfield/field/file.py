@@ -1,9 +1,10 @@
-"""The file of a reflectance field, `field.rfld`, version 3.
+"""The file of a reflectance field, `field.rfld`, version 4.
 
-A ZIP archive of `header.json` and one member for each array of `model.ARRAYS`, packed as
-`array_coding` describes. The header names format and version and, for each array, its dtype,
-shape, filter, context bits and the SHA-256 of its member. Time stamps are fixed, so equal
-fields give equal bytes.
+A ZIP archive of `header.json` and one member for each array of the model's schema
+(`field.reflectance_field.SCHEMAS`), packed as `array_coding` describes. The header names
+format, version and model and, for each array, its dtype, shape, filter, context bits and the
+SHA-256 of its member. Version 3, which is read too, knows clustered fields only and names no
+model. Time stamps are fixed, so equal fields give equal bytes.
 
 Opening reads the header alone; an array is read, and its checksum compared,
 when it is first used. Nothing is unpickled, nothing is extracted to disk, and
@@ -18,7 +19,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
@@ -30,12 +31,12 @@ from numpy.typing import NDArray
 
 from reflfield.errors import FieldFileError, InputError
 from reflfield.field.array_coding import FILTERS, pack, unpack
+from reflfield.field.array_schemas import SCHEMAS, Schema, check_arrays, node_side
 from reflfield.field.reflectance_field import (
-    ARRAYS,
+    ClusteredField,
+    HalfVectorField,
     ReflectanceField,
-    check_arrays,
     check_options,
-    node_side,
 )
 from reflfield.field.stored_values import (
     LONGEST_AXIS,
@@ -46,7 +47,7 @@ from reflfield.field.stored_values import (
 from reflfield.util.files import check_regular, replacing
 
 FORMAT_NAME = "reflfield-field"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 OLDEST_VERSION = 3
 
 HEADER = "header.json"
@@ -63,6 +64,11 @@ FIXED_TIME = (1980, 1, 1, 0, 0, 0)
 # are packed both ways, and the better one is kept.
 KNOWN_FILTERS = {"faces": "fresh", "texel_of_pixel": "delta", "turns": "none"}
 TRIED_FILTERS = ("none", "delta")
+
+
+def schema_of(reflectance_field: ReflectanceField) -> Schema:
+    """Arrays of a field's file, in their order."""
+    return SCHEMAS[reflectance_field.model]
 
 
 def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
@@ -83,7 +89,8 @@ def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
         If the target cannot be written.
     """
     with replacing(Path(path)) as partial, partial.open("w+b") as file:
-        members = {n: packed_array(n, reflectance_field.arrays[n]) for n in ARRAYS}
+        names = schema_of(reflectance_field)
+        members = {n: packed_array(n, reflectance_field.arrays[n]) for n in names}
         _write_archive(file, reflectance_field, members)
 
 
@@ -95,7 +102,8 @@ class PackedSizes:
 
     def of(self, reflectance_field: ReflectanceField) -> int:
         """Bytes of the file that `write_field` would write."""
-        members = {n: self._array(n, reflectance_field.arrays[n]) for n in ARRAYS}
+        names = schema_of(reflectance_field)
+        members = {n: self._array(n, reflectance_field.arrays[n]) for n in names}
         buffer = io.BytesIO()
         _write_archive(buffer, reflectance_field, members)
         return buffer.tell()
@@ -146,7 +154,7 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
     path = Path(path)
     with _archive(path) as archive:
         header = _read_header(path, archive)
-        infos = _members(path, archive)
+        infos = _members(path, archive, SCHEMAS[header["model"]])
         declared = _declared(path, header)
         if any(
             infos[member_name(name)].compress_type != zipfile.ZIP_STORED for name in declared
@@ -217,7 +225,7 @@ class StoredArrays(Mapping[str, NDArray[Any]]):
     def stored_bytes(self) -> dict[str, int]:
         """Bytes of each array in the file, after packing."""
         with _archive(self.path) as archive:
-            infos = _members(self.path, archive)
+            infos = _members(self.path, archive, self.declared)
         return {name: infos[member_name(name)].compress_size for name in self.declared}
 
 
@@ -253,6 +261,7 @@ def _header(reflectance_field: ReflectanceField, members: Mapping[str, PackedArr
         "version": FORMAT_VERSION,
         # Samples are radiance over facing irradiance: the cosine is in them.
         "cosine_included": True,
+        "model": reflectance_field.model,
         "domain": reflectance_field.domain,
         "visibility": reflectance_field.visibility,
         "light_model": reflectance_field.light_model,
@@ -327,10 +336,12 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """All members by name; exactly those of a field, each once."""
+def _members(
+    path: Path, archive: zipfile.ZipFile, arrays: Iterable[str]
+) -> dict[str, zipfile.ZipInfo]:
+    """All members by name; exactly those of a field with these arrays, each once."""
     infos = archive.infolist()
-    expected = sorted([HEADER, *map(member_name, ARRAYS)])
+    expected = sorted([HEADER, *map(member_name, arrays)])
     found = sorted(info.filename for info in infos)
     if found != expected:
         missing = sorted(set(expected) - set(found))
@@ -368,11 +379,17 @@ def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
             f"{path}: written in version {version} of the format, this program reads from "
             f"{OLDEST_VERSION} on; make the field again with `reflfield run`"
         )
+    model = header.setdefault("model", "clustered") if version < 4 else header.get("model")
+    if not isinstance(model, str) or model not in SCHEMAS:
+        raise FieldFileError(
+            f"{path}: model: expected one of {list(SCHEMAS)}, received {model!r:.100}; install "
+            "a newer reflfield"
+        )
     return header
 
 
 def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]:
-    """The header's list of arrays, checked against `model.ARRAYS`."""
+    """The header's list of arrays, checked against the model's schema."""
     with _naming(path):
         declared = {
             str(name): DeclaredArray(
@@ -384,7 +401,8 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
             )
             for name, entry in header["arrays"].items()
         }
-        check_lengths(check_arrays({n: (a.dtype, a.shape) for n, a in declared.items()}))
+        types = {n: (a.dtype, a.shape) for n, a in declared.items()}
+        check_lengths(check_arrays(types, header["model"]), SCHEMAS[header["model"]])
         for name, array in declared.items():
             if array.filter not in FILTERS:
                 raise ValueError(f"{name}: unknown filter {array.filter!r}")
@@ -428,121 +446,27 @@ def _read_array(path: Path, name: str, declared: DeclaredArray) -> NDArray[Any]:
 
 
 def _field(header: Mapping[str, Any], arrays: StoredArrays) -> ReflectanceField:
-    n_view_nodes, n_light_nodes = (
-        arrays.declared[f"{which}_factor"].shape[0] for which in ("view", "light")
-    )
     metadata = header["metadata"]
     if not isinstance(metadata, dict):
         raise ValueError(f"metadata: expected a table, received {metadata!r:.100}")
-    opened = ReflectanceField(
-        arrays=arrays,
-        view_side=node_side("view_factor", n_view_nodes),
-        light_side=node_side("light_factor", n_light_nodes),
-        domain=header["domain"],
-        visibility=header["visibility"],
-        light_model=header["light_model"],
-        metadata=metadata,
-    )
+    shared: dict[str, Any] = {
+        "arrays": arrays,
+        "domain": header["domain"],
+        "visibility": header["visibility"],
+        "light_model": header["light_model"],
+        "metadata": metadata,
+    }
+    opened: ReflectanceField
+    if header["model"] == HalfVectorField.model:
+        opened = HalfVectorField(**shared)
+    else:
+        sides: dict[str, Any] = {
+            f"{which}_side": node_side(
+                f"{which}_factor", arrays.declared[f"{which}_factor"].shape[0]
+            )
+            for which in ("view", "light")
+        }
+        opened = ClusteredField(**shared, **sides)
     # What the metadata say of directions is used much later.
     _ = opened.up, opened.observed_lights
     return opened
-
-
-@dataclass(frozen=True)
-class FieldDescription:
-    """What a field holds, for people.
-
-    Parameters
-    ----------
-    options : dict
-        Domain, visibility, light model.
-    counts : dict of str to int
-        Vertices, faces, texels, clusters, components, grid sides, texture size.
-    memory_bytes, stored_bytes : dict of str to int
-        Size of each array in memory and, for a field opened from a file, in
-        the file.
-    ranges : dict of str to (float, float)
-        Smallest and largest decoded value of each part.
-    metadata : dict
-        As in the field.
-    """
-
-    options: dict[str, str]
-    counts: dict[str, int]
-    memory_bytes: dict[str, int]
-    stored_bytes: dict[str, int]
-    ranges: dict[str, tuple[float, float]]
-    metadata: dict[str, Any]
-
-    def lines(self) -> list[str]:
-        """Return the description as lines of text."""
-        said = [f"{name}: {value}" for name, value in self.options.items()]
-        said += [f"{name}: {value:,}" for name, value in self.counts.items()]
-        said += [f"{n}: {low:.4g} to {high:.4g}" for n, (low, high) in self.ranges.items()]
-        said += [self._size_line(name) for name in self.memory_bytes]
-        said.append(f"total: {_total(self.memory_bytes, self.stored_bytes)}")
-        said += [f"metadata.{name}: {value}" for name, value in self.metadata.items()]
-        return said
-
-    def _size_line(self, name: str) -> str:
-        parts = (
-            {name: d[name]} if name in d else {} for d in (self.memory_bytes, self.stored_bytes)
-        )
-        return f"{name}: {_total(*parts)}"
-
-
-def describe(reflectance_field: ReflectanceField) -> FieldDescription:
-    """Counts, sizes, ranges and options of a field.
-
-    Parameters
-    ----------
-    reflectance_field : ReflectanceField
-        Built or opened. All of its arrays are read, so a damaged file shows.
-
-    Returns
-    -------
-    FieldDescription
-
-    Raises
-    ------
-    FieldFileError
-        If an array of the file is damaged.
-    """
-    f = reflectance_field
-    stored = f.arrays.stored_bytes if isinstance(f.arrays, StoredArrays) else {}
-    height, width = f.texel_of_pixel.shape
-    parts: dict[str, NDArray[np.floating]] = {
-        "positions": f.positions,
-        "coefficients": f.coefficients,
-        "mean": f.mean,
-        "basis": f.basis,
-        "indirect_functions": f.indirect.functions,
-    }
-    return FieldDescription(
-        options={
-            "domain": f.domain,
-            "visibility": f.visibility,
-            "light_model": f.light_model,
-        },
-        counts={
-            "vertices": len(f.positions),
-            "faces": len(f.faces),
-            "texels": f.n_texels,
-            "texture_height": height,
-            "texture_width": width,
-            "clusters": f.n_clusters,
-            "components": f.n_components,
-            "indirect_components": f.indirect.coefficients.shape[1],
-            "view_side": f.view_side,
-            "light_side": f.light_side,
-        },
-        memory_bytes={name: f.arrays[name].nbytes for name in ARRAYS},
-        stored_bytes=stored,
-        ranges={n: (float(a.min()), float(a.max())) for n, a in parts.items() if a.size},
-        metadata=dict(f.metadata),
-    )
-
-
-def _total(memory: Mapping[str, int], stored: Mapping[str, int]) -> str:
-    text = f"{sum(memory.values()):,} bytes"
-    return text + (f", {sum(stored.values()):,} in the file" if stored else "")

@@ -28,13 +28,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import isqrt
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.errors import FieldFileError, InputError, ShapeError
+from reflfield.errors import FieldFileError, InputError
+from reflfield.field.array_schemas import SCHEMAS, check_indices
+from reflfield.field.half_vector import (
+    LEAST_COSINE,
+    HalfVectorModel,
+)
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.observed_sphere import MOST_OBSERVED
 from reflfield.field.quantisation import (
@@ -59,51 +63,17 @@ LIGHT_MODELS = ("known", "unknown")
 # lights of any ordinary unit stay finite as singles.
 LARGEST_SAMPLE = 1e33
 
-_CODES = ("int8", "int16", "int32")
-
-# Stored arrays in file order: the dtypes allowed and the axes, by name. An axis
-# that appears in several arrays must have one length; a number is a fixed one.
-ARRAYS: dict[str, tuple[tuple[str, ...], tuple[str | int, ...]]] = {
-    "positions": (("uint16",), ("n_vertices", 3)),
-    # Files of earlier versions hold float32, which far from the origin is too coarse.
-    "position_box": (("float32", "float64"), (4,)),
-    "faces": (("int32",), ("n_faces", 3)),
-    "uv": (("uint16",), ("n_vertices", 2)),
-    "uv_box": (("float32",), (3,)),
-    "texel_of_pixel": (("int32",), ("height", "width")),
-    "turns": (("int16",), ("n_texels", 3)),
-    "turn_step": (("float32",), (1,)),
-    "cluster": (("uint8", "uint16"), ("n_texels",)),
-    "coefficients": (_CODES, ("n_texels", "n_components")),
-    "coefficient_scale": (("float32",), ("n_clusters", "n_components")),
-    "function_factor": (_CODES, ("n_clusters", "n_functions", "function_rank")),
-    "function_scale": (("float32",), ("function_rank",)),
-    "function_gain": (("float32",), ("n_clusters", "n_functions")),
-    "view_factor": (_CODES, ("n_view_nodes", "view_rank")),
-    "view_scale": (("float32",), ("view_rank",)),
-    "light_factor": (_CODES, ("n_light_nodes", "light_rank")),
-    "light_scale": (("float32",), ("light_rank",)),
-    "colour_factor": (("float32",), (3, 3)),
-    "core": (_CODES, ("function_rank", "view_rank", "light_rank", 3)),
-    "core_scale": (("float32",), (1,)),
-    "indirect_functions": (("float32",), ("n_indirect_functions", "n_harmonics", 3)),
-    "indirect_coefficients": (_CODES, ("n_texels", "n_indirect_components")),
-    "indirect_scale": (("float32",), (1,)),
-}
-
 
 @dataclass(frozen=True, eq=False)
 class ReflectanceField:
-    """A fitted reflectance field. Made by `build.build_field` or `file.open_field`.
+    """What fields of all models share. Made by `build.build_field` or `file.open_field`.
 
     Parameters
     ----------
     arrays : mapping of str to ndarray
-        Stored arrays by the names of `ARRAYS`, quantised.
-    view_side, light_side : int
-        Sides of the two `HemisphereGrid`; 1 means that direction does not vary.
+        Stored arrays by the names of the model's schema, quantised.
     domain : {"cube_root", "square_root", "linear"}
-        Domain of mean and basis.
+        Domain of indirect light, and of a clustered field's mean and basis.
     visibility : {"kept", "factored"}
         "kept": shadows are in the samples; "factored": they are to be traced.
     light_model : {"known", "unknown"}
@@ -114,12 +84,36 @@ class ReflectanceField:
     """
 
     arrays: Mapping[str, NDArray[Any]]
-    view_side: int
-    light_side: int
     domain: Domain = "cube_root"
     visibility: Visibility = "kept"
     light_model: LightModel = "known"
     metadata: dict[str, Any] = field(default_factory=dict)
+
+    model: ClassVar[str]
+
+    def decode(self) -> None:
+        """Decode what evaluation reads, before threads could each do it."""
+        raise NotImplementedError
+
+    @property
+    def light_nodes(self) -> int:
+        """Numbers that a sum over lights keeps of each texel and channel."""
+        raise NotImplementedError
+
+    @property
+    def usual_root(self) -> float:
+        """Root mean square of usual samples in the domain."""
+        raise NotImplementedError
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Sizes of the model, by name."""
+        raise NotImplementedError
+
+    @property
+    def parts(self) -> dict[str, NDArray[np.floating]]:
+        """Decoded parts of the model, by name."""
+        raise NotImplementedError
 
     @cached_property
     def positions(self) -> NDArray[np.float64]:
@@ -143,44 +137,13 @@ class ReflectanceField:
     @cached_property
     def texel_of_pixel(self) -> NDArray[np.int32]:
         """(height, width) int32 nearest texel, -1 where none; row 0 is v = 1."""
-        return check_indices(
-            "texel_of_pixel", self.arrays["texel_of_pixel"], -1, len(self.arrays["cluster"])
-        )
-
-    @cached_property
-    def cluster(self) -> NDArray[np.int32]:
-        """(n_texels,) int32 cluster of each texel."""
-        wide = self.arrays["cluster"].astype(np.int32)
-        return check_indices("cluster", wide, 0, self.n_clusters)
+        return check_indices("texel_of_pixel", self.arrays["texel_of_pixel"], -1, self.n_texels)
 
     @cached_property
     def local_from_world(self) -> NDArray[np.float32]:
         """(n_texels, 3, 3) float32 aligned frames."""
         step = float(self.arrays["turn_step"][0])
         return rotations_from_codes(self.arrays["turns"], step)
-
-    @cached_property
-    def coefficients(self) -> NDArray[np.float32]:
-        """(n_texels, K) float32 weights of the basis functions."""
-        scale = self.arrays["coefficient_scale"][self.cluster]
-        return self.arrays["coefficients"].astype(np.float32) * scale
-
-    @cached_property
-    def node_table(self) -> NDArray[np.float32]:
-        """(n_clusters, n_view_nodes, n_light_nodes, K + 1, 3): mean, then basis.
-
-        Component and channel run fastest, so that one tap reads one run of
-        memory. This is the largest thing a field needs: 31 MB for 16 clusters of
-        10 components on 11 x 11 nodes for each direction, 411 MB on 21 x 21.
-        """
-        for name in ("function", "view", "light", "core"):
-            check_finite(f"{name}_scale", self.arrays[f"{name}_scale"])
-        check_finite("function_gain", self.arrays["function_gain"])
-        check_finite("colour_factor", self.arrays["colour_factor"])
-        with one_core_blas(), np.errstate(over="ignore", invalid="ignore"):
-            table = unfactor_table(self.arrays)
-        self._check_samples("functions", table, 1, self.coefficients)
-        return np.ascontiguousarray(np.moveaxis(table, 1, 3))
 
     @cached_property
     def indirect(self) -> IndirectLight:
@@ -198,7 +161,10 @@ class ReflectanceField:
         most = np.maximum(functions.max(axis=others), -functions.min(axis=others))
         of_weights = np.maximum(weights.max(axis=0, initial=0), -weights.min(axis=0, initial=0))
         bound = float(most[0] + most[1:].astype(np.float64) @ of_weights.astype(np.float64))
-        limit = LARGEST_SAMPLE ** (1.0 / self.inverse_power)
+        self._check_bound(name, bound, LARGEST_SAMPLE ** (1.0 / self.inverse_power))
+
+    def _check_bound(self, name: str, bound: float, limit: float) -> None:
+        """Demand a bound on the magnitude of samples below a limit."""
         if not bound <= limit:  # nor is NaN
             wrong = (
                 f"{name}: expected finite numbers, in all at most {limit:.3g}, received "
@@ -232,35 +198,9 @@ class ReflectanceField:
         return directions / lengths
 
     @property
-    def mean(self) -> NDArray[np.float32]:
-        """(n_clusters, n_view_nodes, n_light_nodes, 3) float32."""
-        return self.node_table[..., 0, :]
-
-    @property
-    def basis(self) -> NDArray[np.float32]:
-        """(n_clusters, K, n_view_nodes, n_light_nodes, 3) float32."""
-        return np.moveaxis(self.node_table[..., 1:, :], 3, 1)
-
-    @cached_property
-    def component_weights(self) -> NDArray[np.float32]:
-        """(n_texels, K + 1) float32: 1 for the mean, then the coefficients."""
-        ones = np.ones((self.n_texels, 1), np.float32)
-        return np.concatenate([ones, self.coefficients], axis=1)
-
-    @property
     def n_texels(self) -> int:
         """Number of texels."""
-        return len(self.cluster)
-
-    @property
-    def n_clusters(self) -> int:
-        """Number of clusters."""
-        return len(self.arrays["coefficient_scale"])
-
-    @property
-    def n_components(self) -> int:
-        """Number of basis functions of a cluster."""
-        return int(self.arrays["coefficient_scale"].shape[1])
+        return len(self.arrays["turns"])
 
     @property
     def up(self) -> NDArray[np.float64]:
@@ -286,8 +226,168 @@ class ReflectanceField:
         return INVERSE_POWER[self.domain]
 
 
-def check_options(domain: str, visibility: str, light_model: str) -> None:
-    """Demand known words for the three options of a field.
+@dataclass(frozen=True, eq=False)
+class ClusteredField(ReflectanceField):
+    """Field of clusters, each with mean and basis on the nodes of two grids.
+
+    Parameters
+    ----------
+    view_side, light_side : int
+        Sides of the two `HemisphereGrid`; 1 means that direction does not vary.
+    """
+
+    model: ClassVar[str] = "clustered"
+    view_side: int = 1
+    light_side: int = 1
+
+    def decode(self) -> None:
+        """Decode what evaluation reads, before threads could each do it."""
+        _ = (self.node_table, self.component_weights, self.local_from_world)
+
+    @property
+    def light_nodes(self) -> int:
+        """Numbers that a sum over lights keeps of each texel and channel."""
+        return self.light_side**2
+
+    @property
+    def usual_root(self) -> float:
+        """Root mean square of the means, in the domain."""
+        return float(np.sqrt(np.mean(np.square(self.mean, dtype=np.float64))))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Sizes of the model, by name."""
+        return {
+            "clusters": self.n_clusters,
+            "components": self.n_components,
+            "view_side": self.view_side,
+            "light_side": self.light_side,
+        }
+
+    @property
+    def parts(self) -> dict[str, NDArray[np.floating]]:
+        """Decoded parts of the model, by name."""
+        return {"coefficients": self.coefficients, "mean": self.mean, "basis": self.basis}
+
+    @cached_property
+    def cluster(self) -> NDArray[np.int32]:
+        """(n_texels,) int32 cluster of each texel."""
+        wide = self.arrays["cluster"].astype(np.int32)
+        return check_indices("cluster", wide, 0, self.n_clusters)
+
+    @cached_property
+    def coefficients(self) -> NDArray[np.float32]:
+        """(n_texels, K) float32 weights of the basis functions."""
+        scale = self.arrays["coefficient_scale"][self.cluster]
+        return self.arrays["coefficients"].astype(np.float32) * scale
+
+    @cached_property
+    def node_table(self) -> NDArray[np.float32]:
+        """(n_clusters, n_view_nodes, n_light_nodes, K + 1, 3): mean, then basis.
+
+        Component and channel run fastest, so that one tap reads one run of
+        memory. This is the largest thing a field needs: 31 MB for 16 clusters of
+        10 components on 11 x 11 nodes for each direction, 411 MB on 21 x 21.
+        """
+        for name in ("function", "view", "light", "core"):
+            check_finite(f"{name}_scale", self.arrays[f"{name}_scale"])
+        check_finite("function_gain", self.arrays["function_gain"])
+        check_finite("colour_factor", self.arrays["colour_factor"])
+        with one_core_blas(), np.errstate(over="ignore", invalid="ignore"):
+            table = unfactor_table(self.arrays)
+        self._check_samples("functions", table, 1, self.coefficients)
+        return np.ascontiguousarray(np.moveaxis(table, 1, 3))
+
+    @property
+    def mean(self) -> NDArray[np.float32]:
+        """(n_clusters, n_view_nodes, n_light_nodes, 3) float32."""
+        return self.node_table[..., 0, :]
+
+    @property
+    def basis(self) -> NDArray[np.float32]:
+        """(n_clusters, K, n_view_nodes, n_light_nodes, 3) float32."""
+        return np.moveaxis(self.node_table[..., 1:, :], 3, 1)
+
+    @cached_property
+    def component_weights(self) -> NDArray[np.float32]:
+        """(n_texels, K + 1) float32: 1 for the mean, then the coefficients."""
+        ones = np.ones((self.n_texels, 1), np.float32)
+        return np.concatenate([ones, self.coefficients], axis=1)
+
+    @property
+    def n_clusters(self) -> int:
+        """Number of clusters."""
+        return len(self.arrays["coefficient_scale"])
+
+    @property
+    def n_components(self) -> int:
+        """Number of basis functions of a cluster."""
+        return int(self.arrays["coefficient_scale"].shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class HalfVectorField(ReflectanceField):
+    """Field of functions of the half vector that all texels share; see `field.half_vector`."""
+
+    model: ClassVar[str] = "half_vector"
+
+    def decode(self) -> None:
+        """Decode what evaluation reads, before threads could each do it."""
+        _ = self.half_vector
+
+    @property
+    def light_nodes(self) -> int:
+        """Numbers that a sum over lights keeps of each texel and channel."""
+        return 1
+
+    @property
+    def usual_root(self) -> float:
+        """Root mean square of the cube roots of the diffuse colours."""
+        roots = np.cbrt(self.half_vector.diffuse.astype(np.float64))
+        return float(np.sqrt(np.mean(np.square(roots))))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Sizes of the model, by name."""
+        return {"lobes": self.half_vector.n_lobes}
+
+    @property
+    def parts(self) -> dict[str, NDArray[np.floating]]:
+        """Decoded parts of the model, by name."""
+        found = self.half_vector
+        return {"diffuse": found.diffuse, "weights": found.weights, "lobes": found.lobes}
+
+    @cached_property
+    def half_vector(self) -> HalfVectorModel:
+        """Frames, coefficients and tables, decoded."""
+        for name in ("diffuse_scale", "lobe_weight_scale", "lobe_scale", "diffuse_table"):
+            check_finite(name, self.arrays[name])
+        with np.errstate(over="ignore", invalid="ignore"):
+            green, red, blue = self.arrays["diffuse"].astype(np.float32).T
+            roots = np.stack([red + green, green, blue + green], axis=1)
+            diffuse = np.maximum(roots * self.arrays["diffuse_scale"], 0) ** 3
+            weights = self.arrays["lobe_weights"] * self.arrays["lobe_weight_scale"]
+            scale = self.arrays["lobe_scale"][:, None]
+            lobes = np.moveaxis(self.arrays["lobes"] * scale, 0, 1)
+            weights, lobes = (np.maximum(x, 0) ** 3 for x in (weights, lobes))
+            peaks = lobes.max(axis=(1, 2), initial=0.0).astype(np.float64)
+            most = (weights.max(axis=0, initial=0.0).astype(np.float64) * peaks).sum()
+            # The visibility factor is at most 1 over the least cosine.
+            bound = float(most / LEAST_COSINE + np.abs(diffuse).max(initial=0.0))
+        self._check_bound("diffuse, lobe_weights, lobes", bound, LARGEST_SAMPLE)
+        return HalfVectorModel(
+            frames=self.local_from_world,
+            diffuse=diffuse.astype(np.float32),
+            weights=weights.astype(np.float32),
+            lobes=np.ascontiguousarray(lobes, np.float32),
+            diffuse_table=np.ascontiguousarray(self.arrays["diffuse_table"], np.float32),
+        )
+
+
+def check_options(
+    domain: str, visibility: str, light_model: str, model: str = "clustered"
+) -> None:
+    """Demand known words for the options of a field.
 
     Raises
     ------
@@ -298,90 +398,7 @@ def check_options(domain: str, visibility: str, light_model: str) -> None:
         ("domain", domain, tuple(INVERSE_POWER)),
         ("visibility", visibility, VISIBILITIES),
         ("light_model", light_model, LIGHT_MODELS),
+        ("model", model, tuple(SCHEMAS)),
     ):
         if value not in known:
             raise InputError(f"{name}: expected one of {list(known)}, received {value!r}")
-
-
-def check_arrays(declared: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[str, int]:
-    """Demand all arrays of a field, in allowed dtypes and consistent shapes.
-
-    Parameters
-    ----------
-    declared : mapping of str to (dtype name, shape)
-        Nothing but names, dtypes and shapes is looked at.
-
-    Returns
-    -------
-    dict of str to int
-        Length of each named axis.
-
-    Raises
-    ------
-    ShapeError
-        If an array is missing or unknown, or a dtype or shape does not fit.
-    """
-    if set(declared) != set(ARRAYS):
-        raise ShapeError(f"arrays: expected {sorted(ARRAYS)}, received {sorted(declared)}")
-    lengths: dict[str, int] = {}
-    for name, (dtypes, axes) in ARRAYS.items():
-        dtype, shape = declared[name]
-        if dtype not in dtypes:
-            raise ShapeError(f"{name}: expected dtype {' or '.join(dtypes)}, received {dtype}")
-        _check_axes(name, shape, axes, lengths)
-    if lengths["n_functions"] != lengths["n_components"] + 1:
-        raise ShapeError(
-            f"function_factor: expected {lengths['n_components'] + 1} functions, the mean and "
-            f"one a component, received {lengths['n_functions']}"
-        )
-    if lengths["n_indirect_functions"] != lengths["n_indirect_components"] + 1:
-        raise ShapeError(
-            f"indirect_functions: expected {lengths['n_indirect_components'] + 1}, the mean "
-            f"and one a component, received {lengths['n_indirect_functions']}"
-        )
-    node_side("indirect_functions", lengths["n_harmonics"])
-    return lengths
-
-
-def node_side(name: str, n_nodes: int) -> int:
-    """Side of a square grid of `n_nodes` nodes.
-
-    Raises
-    ------
-    ShapeError
-        If `n_nodes` is not the square of a positive number.
-    """
-    side = isqrt(n_nodes)
-    if n_nodes < 1 or side * side != n_nodes:
-        raise ShapeError(f"{name}: expected a square number of nodes, received {n_nodes}")
-    return side
-
-
-def _check_axes(
-    name: str, shape: tuple[int, ...], axes: tuple[str | int, ...], lengths: dict[str, int]
-) -> None:
-    fits = len(shape) == len(axes) and all(
-        got == (lengths.setdefault(axis, got) if isinstance(axis, str) else axis)
-        for got, axis in zip(shape, axes, strict=True)
-    )
-    if not fits:
-        wanted = ", ".join(
-            f"{axis} = {lengths[axis]}" if axis in lengths else str(axis) for axis in axes
-        )
-        raise ShapeError(f"{name}: expected shape ({wanted}), received {shape}")
-
-
-def check_indices(name: str, indices: NDArray[Any], lowest: int, end: int) -> NDArray[Any]:
-    """Return indices after a look at their range; kernels read them unchecked.
-
-    Raises
-    ------
-    InputError
-        If one is out of range.
-    """
-    if indices.size and not (lowest <= int(indices.min()) and int(indices.max()) < end):
-        raise InputError(
-            f"{name}: expected indices from {lowest} to {end - 1}, received "
-            f"{int(indices.min())} to {int(indices.max())}"
-        )
-    return indices

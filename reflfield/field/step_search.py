@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, log2
-
-import numpy as np
+from typing import TypeVar
 
 from reflfield.errors import InputError
 from reflfield.field.file import PackedSizes
 from reflfield.field.reflectance_field import ReflectanceField
 
-Build = Callable[[float], ReflectanceField]
+Field = TypeVar("Field", bound=ReflectanceField)
 
 # Steps are searched within this factor of where the search begins.
 WIDEST = 2.0**12
@@ -23,7 +22,7 @@ MAX_CANDIDATES = 14
 START_SHARE = 2.0**-10
 
 
-def field_of_size(build: Build, step: float, size: int) -> ReflectanceField:
+def field_of_size(build: Callable[[float], Field], step: float, size: int) -> Field:
     """Field whose file comes close to a size, from below.
 
     Parameters
@@ -107,19 +106,21 @@ class _Bracket:
         return self.low + min(max(share, 0.1), 0.9) * self.width
 
 
-def _first_step(build: Build, step: float) -> float:
+def _first_step(build: Callable[[float], Field], step: float) -> float:
     """Step that a search can begin with: a model that fits exactly gives none."""
     if not 0 <= step < inf:
         raise InputError(f"step: expected a number >= 0, received {step}")
     if step > 0:
         return step
-    size = float(np.sqrt(np.mean(np.square(build(0.0).mean, dtype=np.float64))))
-    return START_SHARE * size or 1.0
+    return START_SHARE * build(0.0).usual_root or 1.0
 
 
 def field_of_quality(
-    build: Build, measure: Callable[[ReflectanceField], float], step: float, least: float
-) -> ReflectanceField:
+    build: Callable[[float], Field],
+    measure: Callable[[Field], float],
+    step: float,
+    least: float,
+) -> Field:
     """Smallest field of at least a quality; the finest if none reaches it.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Stage "compression": clustered local PCA, fitted to the samples, to a field file."""
+"""Stage "compression": a model fitted to samples and photographs, to a field file."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.clustered_pca import HALF_VECTOR
 from reflfield.field.file import write_field
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.pipeline.alignment import aligned_frames
 from reflfield.pipeline.cache import plain
 from reflfield.pipeline.completion import completion_of
 from reflfield.pipeline.context import Job
+from reflfield.pipeline.half_vector_fit import write_half_vector_field
 from reflfield.pipeline.model_fitting import fitted_model
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.pipeline.resampling import ALL_COEFFICIENTS, Resampled
@@ -24,7 +26,9 @@ Floats = NDArray[np.float32]
 
 
 def write_compression(job: Job, folder: Path) -> dict[str, Any]:
-    """Clusters, mean, basis and coefficients of the aligned texels -> field."""
+    """Fit the model that was asked for -> field."""
+    if job.options.compression.model == HALF_VECTOR:
+        return write_half_vector_field(job, folder)
     stored = job.result("resampling", "resampling.npz")
     coefficients = stored.pop(ALL_COEFFICIENTS)
     found = Resampled(aligned_frames(job), completion_of(stored), coefficients)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,13 @@ from reflfield.util.files import load_arrays
 
 # What an option says that is decided by comparison.
 AUTO = "auto"
+# Stages whose results on a surface from normals stand beside those on the hull.
+ON_SURFACE = {
+    "atlas": "surface",
+    "visibility": "surface_visibility",
+    "observations": "surface_observations",
+    "indirect": "surface_indirect",
+}
 # In the folder of the observations: the samples, or the name of the place where they are.
 SAMPLES, ELSEWHERE = RESTARTABLE[0], "samples.location"
 
@@ -56,6 +63,8 @@ class Job:
         Of the stages; by default, new ones in `out`.
     digests : FileDigests, optional
         Of the files that are read.
+    on_surface : bool
+        Whether results are those on the surface from normals, not those on the hull.
     """
 
     capture: Capture
@@ -67,11 +76,23 @@ class Job:
     asked: PipelineOptions | None = None
     folders: StageFolder | None = None
     digests: FileDigests = field(default_factory=FileDigests)
+    on_surface: bool = False
 
     @cached_property
     def stages(self) -> StageFolder:
         """Folders of the stages."""
         return self.folders or StageFolder(self.out / "stages", set(self.redo))
+
+    @cached_property
+    def refined(self) -> Job:
+        """The job on the surface from normals, where there is one."""
+        if not self.options.refines_surface or self.on_surface:
+            return self
+        return replace(self, folders=self.stages, on_surface=True)
+
+    def folder_of(self, stage: str) -> Path:
+        """Folder of a stage's result, on the surface that this job is about."""
+        return self.stages.root / (ON_SURFACE.get(stage, stage) if self.on_surface else stage)
 
     def digest_of(self, capture: Capture, *parts: str) -> str:
         """Digest of parts of a capture, of all without any; see `Capture.digest`."""
@@ -96,7 +117,7 @@ class Job:
     @property
     def samples_location(self) -> Location:
         """Where the samples of all texels are: in their stage's folder, or in a store."""
-        folder = self.stages.root / "observations"
+        folder = self.folder_of("observations")
         if (folder / ELSEWHERE).is_file():
             return (folder / ELSEWHERE).read_text()
         return folder / SAMPLES
@@ -258,4 +279,4 @@ class Job:
         InputError
             If the file is damaged, or holds more than the memory.
         """
-        return load_arrays(self.stages.root / stage / name, self.resources.max_memory)
+        return load_arrays(self.folder_of(stage) / name, self.resources.max_memory)

@@ -26,6 +26,7 @@ AVERAGES = "averages.npz"
 
 def write_maps(job: Job, folder: Path) -> dict[str, Any]:
     """Pictures in texture space, and the mesh with its mean texture."""
+    job = job.refined
     field = open_field(job.stages.root / "compression" / "field.rfld")
     _write_maps(job, field, folder)
     average = average_samples(job, folder)

@@ -106,7 +106,7 @@ def _fits(job: Job, visibility: str) -> tuple[str, ...]:
     that those of enough texels would not fit in memory.
     """
     options = job.asked_options.compression
-    if options.fit != AUTO:
+    if options.fit != AUTO or not job.asked_options.aligns:
         return (options.fit,)
     settled = Candidate(visibility, AUTO).settled(job.asked_options)
     n = samples_per_texel(replace(job, options=settled))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from reflfield.errors import InputError
-from reflfield.field.clustered_pca import CompressionOptions
+from reflfield.field.clustered_pca import CLUSTERED, CompressionOptions
 from reflfield.geometry.occlusion import VisibilityOptions
 from reflfield.geometry.uv_atlas import LARGEST_TEXTURE, AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
@@ -185,6 +185,16 @@ class PipelineOptions:
     seed: int = 0
 
     @property
+    def aligns(self) -> bool:
+        """Whether texels are completed and aligned: what a clustered field is made of."""
+        return self.compression.model == CLUSTERED
+
+    @property
+    def refines_surface(self) -> bool:
+        """Whether the hull is moved to the normals that are fitted."""
+        return not self.aligns and self.compression.half_vector.moves_surface
+
+    @property
     def compares_without_alignment(self) -> bool:
         """Whether a second field, in the base frames, is made to compare with."""
         return self.comparison.without_alignment and self.alignment.enabled
@@ -196,5 +206,10 @@ class PipelineOptions:
         return self.comparison.rate_distortion or asked
 
     def __post_init__(self) -> None:
+        if self.comparison.without_alignment and not self.aligns:
+            raise InputError(
+                f"comparison.without_alignment: expected compression.model = {CLUSTERED!r}, "
+                f"whose frames are aligned, received {self.compression.model!r}"
+            )
         if self.seed < 0:
             raise InputError(f"seed: expected 0 or more, received {self.seed}")

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 RESULTS = {
     "compression": {"field.rfld": "field.rfld"},
     "hull": {"hull.ply": "hull.ply"},
+    "surface": {"surface.ply": "surface.ply"},
     "maps": {name: name for name in ("atlas.glb", "normals.exr", "tangents.exr")},
     "comparison": {"metrics.json": "metrics.json"},
     "report": {"index.html": "report/index.html"},

@@ -20,7 +20,7 @@ from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.file import PackedSizes
 from reflfield.field.observed_sphere import distinct_directions
-from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.field.reflectance_field import ClusteredField
 from reflfield.field.step_search import field_of_quality, field_of_size
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.image_projection import directions_of
@@ -81,7 +81,7 @@ class FieldMaker:
             indirect=self.job.indirect_light,
         )
 
-    def build(self, model: ClusteredModel, frames: Floats, step: float) -> ReflectanceField:
+    def build(self, model: ClusteredModel, frames: Floats, step: float) -> ClusteredField:
         """Quantise the model on the base surface into a field."""
         job, atlas = self.job, self.job.surface_atlas
         surface = BaseSurface(
@@ -99,12 +99,12 @@ class FieldMaker:
             quantisation=Quantisation(step),
         )
 
-    def made(self, model: ClusteredModel, frames: Floats) -> ReflectanceField:
+    def made(self, model: ClusteredModel, frames: Floats) -> ClusteredField:
         """Field of the size, the quality or the coarseness that was asked for."""
         options = self.options
         step = options.coarseness * model.residuals[-1]
 
-        def build(at: float) -> ReflectanceField:
+        def build(at: float) -> ClusteredField:
             return self.build(model, frames, at)
 
         if options.size:
@@ -113,7 +113,7 @@ class FieldMaker:
             return field_of_quality(build, self.quality, step, options.psnr)
         return build(step)
 
-    def quality(self, field: ReflectanceField) -> float:
+    def quality(self, field: ClusteredField) -> float:
         """LDR PSNR on the samples, dB."""
         job = self.job
         found = sample_error(field, job.base_reader, job.seen_texels, SAMPLES_MEASURED)
@@ -161,7 +161,7 @@ class FieldMaker:
             for _, n, used in sorted(candidates)
         ]
 
-    def _cost(self, field: ReflectanceField, model: ClusteredModel, frames: Floats) -> float:
+    def _cost(self, field: ClusteredField, model: ClusteredModel, frames: Floats) -> float:
         """What is to be least: the error, or the bytes; in dB below the goal if missed."""
         options = self.options
         if options.size:
@@ -172,7 +172,7 @@ class FieldMaker:
         return float(PackedSizes().of(field)) if missing <= CLOSE_DB else 1e12 * (1 + missing)
 
 
-def components_used(field: ReflectanceField) -> int:
+def components_used(field: ClusteredField) -> int:
     """Components that have a coefficient other than zero.
 
     Components are sorted by what they explain.

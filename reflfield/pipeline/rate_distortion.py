@@ -9,13 +9,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from reflfield.field.file import PackedSizes
-from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
 from reflfield.metrics.held_out_photographs import compare_with_photographs
 from reflfield.metrics.image_metrics import NothingToMeasure
 from reflfield.pipeline.compared_photographs import frame_sets
 from reflfield.pipeline.comparison import MAIN, variants
 from reflfield.pipeline.compression import stored_model
 from reflfield.pipeline.context import Job
+from reflfield.pipeline.half_vector_fit import HalfVectorFit, stored_half_vector
 from reflfield.pipeline.held_out_silhouettes import silhouettes_of_frames
 from reflfield.pipeline.memory import within_memory
 from reflfield.pipeline.quantisation_search import FieldMaker
@@ -25,23 +26,39 @@ from reflfield.util.progress import track
 # Steps over the residual of the fit.
 COARSENESS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 CURVES = {MAIN: "with alignment", "without_alignment": "without alignment"}
+HALF_VECTOR = "half vector"
 PAPER = "half floats, not factored"
 POINTS = "points.json"
 
 
 def write_rate_distortion(job: Job, folder: Path) -> dict[str, Any]:
     """Size and quality of every model at every step, and in the layout of the paper."""
+    points = _clustered_points(job) if job.options.aligns else _half_vector_points(job)
+    (folder / POINTS).write_text(json.dumps([asdict(point) for point in points], indent=1))
+    return {"fields": len(points)}
+
+
+def _half_vector_points(job: Job) -> list[RatePoint]:
+    fit, model, sizes = HalfVectorFit(job.refined), stored_half_vector(job), PackedSizes()
+    points = []
+    for coarseness in track(COARSENESS, len(COARSENESS), "quality against size"):
+        field = fit.build(model, fit.step(coarseness))
+        points.append(_point(job, fit.quality(field), field, HALF_VECTOR, sizes.of(field)))
+    return points
+
+
+def _clustered_points(job: Job) -> list[RatePoint]:
     todo = [(v, stage, c) for v, stage in variants(job).items() for c in COARSENESS]
     maker, sizes, points = FieldMaker(job, job.options.compression, {}), PackedSizes(), []
     for variant, stage, coarseness in track(todo, len(todo), "quality against size"):
         model, frames = stored_model(job, stage)
         field = maker.build(model, frames, coarseness * model.residuals[-1])
-        points.append(_point(job, maker, field, CURVES[variant], sizes.of(field)))
+        quality = maker.quality(field)
+        points.append(_point(job, quality, field, CURVES[variant], sizes.of(field)))
     model, frames = stored_model(job, "compression")
     exact = maker.build(model, frames, 0.0)
-    points.append(_point(job, maker, exact, PAPER, unfactored_bytes(exact, sizes)))
-    (folder / POINTS).write_text(json.dumps([asdict(point) for point in points], indent=1))
-    return {"fields": len(points)}
+    size = unfactored_bytes(exact, sizes)
+    return [*points, _point(job, maker.quality(exact), exact, PAPER, size)]
 
 
 def stored_points(job: Job) -> list[RatePoint]:
@@ -50,7 +67,7 @@ def stored_points(job: Job) -> list[RatePoint]:
     return [RatePoint(**point) for point in stored]
 
 
-def unfactored_bytes(field: ReflectanceField, sizes: PackedSizes) -> int:
+def unfactored_bytes(field: ClusteredField, sizes: PackedSizes) -> int:
     """Size with mean, basis and coefficients as halves and frames as four, as in the paper.
 
     Surface and clusters as in ours; nothing else is packed.
@@ -63,7 +80,7 @@ def unfactored_bytes(field: ReflectanceField, sizes: PackedSizes) -> int:
 
 
 def _point(
-    job: Job, maker: FieldMaker, field: ReflectanceField, curve: str, size: int
+    job: Job, quality: float, field: ReflectanceField, curve: str, size: int
 ) -> RatePoint:
     heldout = None
     sets = frame_sets(job)
@@ -78,4 +95,4 @@ def _point(
                 ).mean["psnr_ldr"]
             except NothingToMeasure:
                 heldout = None
-    return RatePoint(curve, size, maker.quality(field), heldout)
+    return RatePoint(curve, size, quality, heldout)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.field.file import describe, open_field
+from reflfield.field.description import describe
+from reflfield.field.file import open_field
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.metrics.held_out_photographs import RelitPairs
@@ -62,7 +63,7 @@ def report_content(
         *_ablation_sections(job, compared),
         *_rate_sections(job),
         *_surface_sections(job, field, average),
-        _alignment_section(job),
+        *_alignment_sections(job),
         *_truth_sections(scores, compared.get("truth")),
         _compression_section(job),
         sections.bookkeeping_section(list(accounts_of(job))),
@@ -265,9 +266,11 @@ def _rate_sections(job: Job) -> Iterator[Section]:
     )
 
 
-def _alignment_section(job: Job) -> Section:
+def _alignment_sections(job: Job) -> Iterator[Section]:
+    if not job.options.aligns:
+        return
     stored = job.result("alignment", "alignment.npz")
-    return sections.alignment_section(stored["history"], stored["margin"][job.seen_texels])
+    yield sections.alignment_section(stored["history"], stored["margin"][job.seen_texels])
 
 
 def _truth_sections(

@@ -72,11 +72,9 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> CountedItems:
             "in shadow: at its edge": mixed,
             "in shadow: nothing made of them": int(shadowed) - shown - mixed,
             "not measured in any channel": unmeasured,
-            "below the horizon of the texel's frame, or outside the light's cone": counts[
-                "completion"
-            ]["samples observed"]
-            - used
-            - unmeasured,
+            "below the horizon of the texel's frame, or outside the light's cone": (
+                observed.count() - used - unmeasured
+            ),
         },
     )
 
@@ -101,8 +99,24 @@ def _values(job: Job, projected: dict[str, Any]) -> CountedItems:
 
 
 def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[CountedItems]:
-    """Texels of the atlas through completion, alignment and compression."""
+    """Texels of the atlas through completion and alignment, if any, and compression."""
     n = len(job.texels)
+    if job.options.aligns:
+        yield from _aligned_texels(counts, n)
+    fitted = counts["compression"]
+    yield CountedItems(
+        "compression",
+        "texels",
+        n,
+        {
+            "fitted to their samples": fitted["texels fitted"],
+            "repeat the nearest that is": fitted["texels that repeat another"],
+        },
+    )
+
+
+def _aligned_texels(counts: dict[str, dict[str, Any]], n: int) -> Iterator[CountedItems]:
+    """Texels through completion and alignment."""
     completed = counts["completion"]
     unseen = completed["texels without samples"]
     yield CountedItems(
@@ -120,16 +134,6 @@ def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[CountedItem
             "frame found": aligned["texels aligned"],
             "keep the base frame": aligned["texels that keep the base frame"],
             "without samples": unseen,
-        },
-    )
-    fitted = counts["compression"]
-    yield CountedItems(
-        "compression",
-        "texels",
-        n,
-        {
-            "fitted to their samples": fitted["texels fitted"],
-            "repeat the nearest that is": fitted["texels that repeat another"],
         },
     )
 

@@ -38,6 +38,7 @@ from reflfield.pipeline import (
     report,
     resampling,
     silhouettes,
+    surface,
     visibility,
     without_alignment,
 )
@@ -230,12 +231,46 @@ ORDER = (
         options=lambda options: (options.indirect, options.resampling, options.seed),
         wanted=lambda job: job.finds_indirect_light,
     ),
+    # fit on the hull; the hull moved to the normals that were fitted
+    Stage(
+        "surface",
+        surface.write_surface,
+        after=("observations", "indirect"),
+        options=lambda options: (options.compression, options.resampling, options.seed),
+        wanted=lambda job: job.options.refines_surface,
+    ),
+    # which camera and which light each texel of the new surface sees
+    Stage(
+        "surface_visibility",
+        surface.write_surface_visibility,
+        after=("surface",),
+        options=lambda options: options.visibility,
+        wanted=lambda job: job.options.refines_surface,
+    ),
+    # photographs -> samples of the new surface
+    Stage(
+        "surface_observations",
+        surface.write_surface_observations,
+        after=("surface_visibility",),
+        reads=lambda job: {"photographs": job.digest_of(job.training, "photographs")},
+        wanted=lambda job: job.options.refines_surface,
+        intact=surface.lost_surface_observations,
+    ),
+    # samples in shadow -> indirect light on the new surface
+    Stage(
+        "surface_indirect",
+        surface.write_surface_indirect,
+        after=("surface_observations",),
+        options=lambda options: (options.indirect, options.resampling, options.seed),
+        wanted=lambda job: job.options.refines_surface and job.finds_indirect_light,
+    ),
     # scattered directions -> common grid; missing samples filled
     Stage(
         "completion",
         completion.write_completion,
         after=("observations",),
         options=lambda options: (options.completion, options.resampling, options.seed),
+        wanted=lambda job: job.options.aligns,
     ),
     # one local frame per texel
     Stage(
@@ -243,6 +278,7 @@ ORDER = (
         alignment.write_alignment,
         after=("completion",),
         options=lambda options: (options.alignment, options.seed),
+        wanted=lambda job: job.options.aligns,
     ),
     # raw samples again, in the aligned frames, on the grid; missing samples filled
     Stage(
@@ -254,13 +290,17 @@ ORDER = (
             options.compression.training_texels,
             options.seed,
         ),
+        wanted=lambda job: job.options.aligns,
     ),
-    # clustered local PCA, fitted to the raw samples -> field file
+    # model fitted to the raw samples, and to the photographs -> field file
     Stage(
         "compression",
         compression.write_compression,
-        after=("resampling", "indirect"),
-        options=lambda options: (options.compression, options.seed),
+        after=(
+            *("observations", "resampling", "indirect"),
+            *("surface_observations", "surface_indirect"),
+        ),
+        options=lambda options: (options.compression, options.resampling, options.seed),
         reads=field_metadata_digest,
     ),
     # the field's frames as pictures, the mesh with its mean texture

@@ -98,7 +98,9 @@ def frame_scores(
     seen = job.seen_texels
     reach = MATCH_SPACINGS * job.texels.spacing
     position = job.texels.position[seen]
-    target = job.result("alignment", "alignment.npz")["cluster"][seen]
+    target = np.zeros(len(seen), np.int32)
+    if job.options.aligns:
+        target = job.result("alignment", "alignment.npz")["cluster"][seen]
     return (
         frame_errors(position, field.local_from_world[seen], surface, reach, target),
         frame_errors(position, job.texels.local_from_world[seen], surface, reach, 0 * target),
@@ -112,7 +114,7 @@ def completion_score(job: Job, truth: Truth) -> CompletionError | None:
     completed function is evaluated for all its directions.
     """
     points = truth.samples()
-    if points is None or not job.training.lights_known:
+    if points is None or not job.training.lights_known or not job.options.aligns:
         return None
     counts, expected = points["samples"].shape[1:3], (job.capture.n_views, job.capture.n_lights)
     if counts != expected:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from reflfield.field.evaluation import clustered
 from reflfield.field.file import open_field
 from reflfield.pipeline.alignment import AlignedFrames
 from reflfield.pipeline.cache import plain
@@ -24,7 +25,7 @@ def write_without_alignment(job: Job, folder: Path) -> dict[str, Any]:
     frames = AlignedFrames(base, np.zeros(0, np.intp))
     made_with = plain(replace(job.options, alignment=AlignmentOptions(enabled=False)))
     del made_with["completion"]
-    aligned_field = open_field(job.stages.root / "compression" / "field.rfld")
+    aligned_field = clustered(open_field(job.stages.root / "compression" / "field.rfld"))
     alike = replace(
         job.options.compression,
         n_clusters=aligned_field.n_clusters,

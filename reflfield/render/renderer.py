@@ -172,7 +172,7 @@ class Renderer:
         self.surface = FieldSurface(field, 1, self.options.ray_offset)
         self._environments: dict[object, EnvironmentLighting] = {}
         # Decoded here, before threads could each do it.
-        _ = (field.node_table, field.component_weights, field.local_from_world)
+        field.decode()
 
     def render(self, camera: Camera, lights: Lighting) -> Rendering:
         """Make one image.
@@ -333,7 +333,7 @@ class EnvironmentLighting:
         distinct, where = np.unique(texels, return_inverse=True)
         result = np.zeros((len(distinct), 3))
         field = self._surface.field
-        step = max(_NODES_AT_ONCE // max(field.light_side**2, len(self._lights)), 1)
+        step = max(_NODES_AT_ONCE // max(field.light_nodes, len(self._lights)), 1)
         for first in range(0, len(distinct), step):
             block = distinct[first : first + step]
             result[first : first + step] = sum_lights(

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from reflfield.errors import FieldFileError, InputError
 from reflfield.field import file as field_file
+from reflfield.field.array_schemas import ARRAYS
+from reflfield.field.description import describe
 from reflfield.field.evaluation import evaluate
-from reflfield.field.file import describe, open_field, write_field
-from reflfield.field.reflectance_field import ARRAYS
+from reflfield.field.file import open_field, write_field
 
 N_TEXELS = 60
 

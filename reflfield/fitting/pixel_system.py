@@ -1,0 +1,448 @@
+"""Pixels of one view as weighted sums of the texels under them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture
+from reflfield.field.half_vector import (
+    FAST,
+    HalfVectorModel,
+    add_sample,
+    diffuse_value,
+    half_taps,
+    lobe_values,
+    rotated,
+)
+from reflfield.fitting.robust_weights import HUBER, squared_weight
+from reflfield.observations.image_projection import facing_irradiance
+from reflfield.render.camera_rays import FieldSurface, subpixel_offsets
+
+Floats = NDArray[np.float32]
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# Rays through a pixel, along each axis three.
+RAYS_PER_PIXEL = 9
+# Least coverage of a pixel by the silhouette, and by the surface seen from its front.
+LEAST_COVERAGE = 0.99
+# A pixel that shows texels at a smaller cosine with more than so much of its area is left out.
+GRAZING_COSINE, GRAZING_SHARE = 0.12, 0.05
+# Half of the step by which rotations are differenced, radians: highlights are a few degrees
+# wide, and the tables bilinear between nodes a degree apart.
+HALF_ANGLE = np.float32(0.008)
+# Rotations about the texel's own axes: two tilts and the turn about the normal.
+N_ROTATIONS = 3
+PIXELS_AT_ONCE = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """Texels under the usable pixels of a view.
+
+    Parameters
+    ----------
+    pixels : (n_pixels, 2) int
+        Row and column.
+    first : (n_pixels + 1,) int64
+        First entry of each pixel.
+    texel : (n_entries,) int32
+    share : (n_entries,) float32
+        Of the pixel; they sum to 1.
+    """
+
+    pixels: NDArray[np.int64]
+    first: NDArray[np.int64]
+    texel: NDArray[np.int32]
+    share: Floats
+
+
+def footprint_of(
+    surface: FieldSurface, camera: Camera, usable: Bools, positions: Array, normals: Floats
+) -> Footprint:
+    """Texels under the pixels that the surface covers, not at a grazing angle.
+
+    Parameters
+    ----------
+    surface : FieldSurface
+    camera : Camera
+    usable : (height, width) bool
+        Pixels that may be taken.
+    positions, normals : (n_texels, 3) float
+        Of the texels.
+    """
+    rows, columns = np.nonzero(usable)
+    parts = [
+        _footprint_part(surface, camera, rows[first:end], columns[first:end])
+        for first in range(0, len(rows), PIXELS_AT_ONCE)
+        for end in [first + PIXELS_AT_ONCE]
+    ]
+    if not parts:
+        nothing = np.zeros(0, np.int64)
+        return _without_grazing(camera, nothing, nothing, nothing, nothing, positions, normals)
+    starts = np.arange(0, len(rows), PIXELS_AT_ONCE)
+    pixel = np.concatenate([p[0] + s for p, s in zip(parts, starts, strict=True)])
+    texel, weight = (np.concatenate([p[i] for p in parts]) for i in (1, 2))
+    covered = np.bincount(pixel, weight, minlength=len(rows))
+    kept = covered[pixel] >= LEAST_COVERAGE * RAYS_PER_PIXEL
+    share = weight[kept] / covered[pixel[kept]]
+    at = np.stack([rows, columns], axis=1)
+    return _without_grazing(camera, at, pixel[kept], texel[kept], share, positions, normals)
+
+
+def _footprint_part(
+    surface: FieldSurface, camera: Camera, rows: Any, columns: Any
+) -> tuple[Any, Any, Any]:
+    """Pixel, texel and number of rays of the entries of some pixels."""
+    offsets = subpixel_offsets(RAYS_PER_PIXEL)
+    points = np.stack([columns, rows], axis=1)[:, None] + offsets
+    hits = surface.first_hits(*surface.camera_rays(camera, points.reshape(-1, 2)))
+    pixel = hits.ray // RAYS_PER_PIXEL
+    entries = surface.footprints(hits, pixel, surface.transitions(camera, hits))
+    return entries.pixel, entries.texel, entries.summed(hits.front.astype(np.float32))
+
+
+def _without_grazing(
+    camera: Camera,
+    pixels: Any,
+    pixel: Any,
+    texel: Any,
+    share: Any,
+    positions: Array,
+    normals: Floats,
+) -> Footprint:
+    """Entries, by pixel, of those that are not seen at a grazing angle."""
+    towards = camera.view_directions(positions[texel])
+    cosine = np.einsum("nd,nd->n", towards, normals[texel])
+    grazing = np.bincount(pixel, share * (cosine < GRAZING_COSINE), minlength=len(pixels))
+    kept = (share > 0) & (grazing[pixel] < GRAZING_SHARE)
+    used, start = np.unique(pixel[kept], return_index=True)
+    n = int(np.count_nonzero(kept))
+    return Footprint(
+        pixels=pixels[used] if len(used) else np.zeros((0, 2), np.int64),
+        first=np.append(start, n).astype(np.int64),
+        texel=texel[kept].astype(np.int32),
+        share=share[kept].astype(np.float32),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPixels:
+    """Measured pixels of one view, with the texels under them.
+
+    Parameters
+    ----------
+    texels : (m,) int32
+        Seen by the view, ascending.
+    first : (n_pixels + 1,) int64
+        First entry of each pixel.
+    entry : (n_entries,) int32
+        Row in `texels`.
+    share : (n_entries,) float32
+    values : (n_pixels, n_lights, 3) float32
+        Radiance over irradiance, in units of white; NaN where not to be used.
+    views : (m, 3) float32
+    lights : (m, n_lights, 3) float32
+        Unit directions from each texel, world frame.
+    """
+
+    texels: NDArray[np.int32]
+    first: NDArray[np.int64]
+    entry: NDArray[np.int32]
+    share: Floats
+    values: Floats
+    views: Floats
+    lights: Floats
+
+    @property
+    def n_used(self) -> int:
+        """Values that count, all channels of one as one."""
+        return int(np.count_nonzero(~np.isnan(self.values).all(axis=2)))
+
+
+def view_pixels(
+    capture: Capture,
+    view: int,
+    footprint: Footprint,
+    positions: Array,
+    reliable: Bools,
+    white: float,
+) -> ViewPixels:
+    """Read the photographs of a view at the pixels of a footprint.
+
+    Parameters
+    ----------
+    capture : Capture
+    view : int
+    footprint : Footprint
+    positions : (n_texels, 3) float64
+    reliable : (n_texels, n_lights) bool
+        Lights that reach the texel and its surroundings.
+    white : float
+        What 1 stands for, 1/sr.
+    """
+    photographs = capture.photograph_index[view]
+    shown = np.flatnonzero(photographs >= 0)
+    texels, entry = np.unique(footprint.texel, return_inverse=True)
+    starts = footprint.first[:-1]
+    values = np.full((len(starts), len(shown), 3), np.nan, np.float32)
+    lights = tuple(capture.lights[i] for i in shown)
+    if len(starts):
+        weighted = positions[footprint.texel] * footprint.share[:, None]
+        irradiance = facing_irradiance(lights, np.add.reduceat(weighted, starts))
+        lit = np.logical_and.reduceat(reliable[footprint.texel][:, shown], starts)
+        for i, photograph in enumerate(photographs[shown]):
+            image, measured = capture.read_measured(int(photograph))
+            row, column = footprint.pixels.T
+            value = image[row, column] / (irradiance[:, i] * np.float32(white))
+            good = measured[row, column] & lit[:, [i]] & (irradiance[:, i] > 0)
+            values[:, i] = np.where(good, value, np.float32(np.nan))
+    points = positions[texels]
+    directions = [light.directions(points) for light in lights]
+    return ViewPixels(
+        texels=texels.astype(np.int32),
+        first=footprint.first,
+        entry=entry.ravel().astype(np.int32),
+        share=footprint.share,
+        values=values,
+        views=capture.cameras[view].view_directions(points).astype(np.float32),
+        lights=np.stack(directions, axis=1).astype(np.float32),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """Derivatives of the samples of a view's texels by their unknowns.
+
+    Parameters
+    ----------
+    diffuse : (m, n_lights) float32
+        By the diffuse colour, the same for all channels.
+    lobes : (m, n_lights, K, 3) float32
+    rotations : (m, n_lights, 3, 3) float32
+        By rotations about the texel's axes; channels last.
+    weight : (n_pixels, n_lights, 3) float32
+        Of the squared residual of each value; 0 where it does not count.
+    """
+
+    diffuse: Floats
+    lobes: Floats
+    rotations: Floats
+    weight: Floats
+
+    @property
+    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """As kernels take them."""
+        return self.diffuse, self.lobes, self.rotations, self.weight
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _used_entries(geometry: Any, values: Any, used: Any) -> None:
+    """Mark the texels and lights (m, n_lights) that some value needs."""
+    first, entry, _ = geometry
+    for pixel in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            if not np.isnan(values[pixel, j]).all():
+                for e in range(first[pixel], first[pixel + 1]):
+                    used[entry[e], j] = True
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _derivatives(texels: Any, views: Any, lights: Any, used: Any, model: Any, out: Any) -> None:
+    frames, diffuse, weights, lobes, table = model
+    by_diffuse, by_lobes, by_rotations = out
+    frame = np.zeros((2 * N_ROTATIONS, 3, 3), np.float32)
+    ahead, behind = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    for row in range(len(texels)):
+        t = texels[row]
+        for r in range(N_ROTATIONS):
+            rotated(frames[t], r, HALF_ANGLE, frame[2 * r])
+            rotated(frames[t], r, -HALF_ANGLE, frame[2 * r + 1])
+        for j in range(lights.shape[1]):
+            if not used[row, j]:
+                continue
+            view, light = views[row], lights[row, j]
+            at_lobe, at_diffuse, cosine, spread = half_taps(frames[t], view, light)
+            by_diffuse[row, j] = cosine * diffuse_value(table, at_diffuse)
+            lobe_values(lobes, at_lobe, cosine * spread, by_lobes[row, j])
+            for r in range(N_ROTATIONS):
+                ahead[:] = np.float32(0.0)
+                behind[:] = np.float32(0.0)
+                tables = (lobes, table)
+                add_sample(frame[2 * r], view, light, diffuse[t], weights[t], tables, ahead)
+                add_sample(
+                    frame[2 * r + 1], view, light, diffuse[t], weights[t], tables, behind
+                )
+                for c in range(3):
+                    by_rotations[row, j, r, c] = (ahead[c] - behind[c]) / (2 * HALF_ANGLE)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _pixel_value(pixel: Any, j: int, geometry: Any, x: Any, system: Any, out: Any) -> None:
+    """A x at one pixel and light, into `out` (3,); x (m, 3 + K + 3)."""
+    first, entry, share = geometry
+    by_diffuse, by_lobes, by_rotations, _ = system
+    n_lobes = by_lobes.shape[2]
+    out[:] = np.float32(0.0)
+    for e in range(first[pixel], first[pixel + 1]):
+        row = entry[e]
+        for c in range(3):
+            value = x[row, c] * by_diffuse[row, j]
+            for k in range(n_lobes):
+                value += x[row, 3 + k] * by_lobes[row, j, k, c]
+            for r in range(N_ROTATIONS):
+                value += x[row, 3 + n_lobes + r] * by_rotations[row, j, r, c]
+            out[c] += share[e] * value
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _add_adjoint(pixel: Any, j: int, geometry: Any, residual: Any, system: Any, y: Any) -> None:
+    """Add A^T of a residual (3,) at one pixel and light to y (m, 3 + K + 3)."""
+    first, entry, share = geometry
+    by_diffuse, by_lobes, by_rotations, _ = system
+    n_lobes = by_lobes.shape[2]
+    for e in range(first[pixel], first[pixel + 1]):
+        row = entry[e]
+        for c in range(3):
+            part = share[e] * residual[c]
+            y[row, c] += part * by_diffuse[row, j]
+            for k in range(n_lobes):
+                y[row, 3 + k] += part * by_lobes[row, j, k, c]
+            for r in range(N_ROTATIONS):
+                y[row, 3 + n_lobes + r] += part * by_rotations[row, j, r, c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _apply(geometry: Any, values: Any, x: Any, system: Any, y: Any) -> None:
+    """Y += A^T W A x."""
+    shown, weight = np.zeros(3, np.float32), system[3]
+    for pixel in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            if weight[pixel, j, 0] + weight[pixel, j, 1] + weight[pixel, j, 2] == 0:
+                continue
+            _pixel_value(pixel, j, geometry, x, system, shown)
+            for c in range(3):
+                shown[c] *= weight[pixel, j, c]
+            _add_adjoint(pixel, j, geometry, shown, system, y)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _add_diagonal(pixel: Any, j: int, geometry: Any, system: Any, diagonal: Any) -> None:
+    """Add the squares of one pixel's derivatives, weighted, to the diagonal."""
+    first, entry, share = geometry
+    by_diffuse, by_lobes, by_rotations, weight = system
+    n_lobes = by_lobes.shape[2]
+    for e in range(first[pixel], first[pixel + 1]):
+        row = entry[e]
+        for c in range(3):
+            w = share[e] * share[e] * weight[pixel, j, c]
+            diagonal[row, c] += w * by_diffuse[row, j] ** 2
+            for k in range(n_lobes):
+                diagonal[row, 3 + k] += w * by_lobes[row, j, k, c] ** 2
+            for r in range(N_ROTATIONS):
+                diagonal[row, 3 + n_lobes + r] += w * by_rotations[row, j, r, c] ** 2
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _weigh(values: Any, shown: Any, weight: Any) -> Any:
+    """Weights of one pixel's channels; `shown` becomes the weighted residual; its square."""
+    error = 0.0
+    for c in range(3):
+        weight[c] = np.float32(0.0)
+        residual = np.float32(0.0)
+        if not np.isnan(values[c]):
+            weight[c] = squared_weight(values[c], shown[c], HUBER)
+            residual = values[c] - shown[c]
+            error += weight[c] * residual * residual
+        shown[c] = weight[c] * residual
+    return error
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _start(geometry: Any, values: Any, x: Any, system: Any, right: Any, diagonal: Any) -> Any:
+    """Weights of values from residuals at x; right side, diagonal; sum of squares, count."""
+    weight = system[3]
+    residual = np.zeros(3, np.float32)
+    error, count = 0.0, 0
+    for pixel in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            measured = 3 - np.isnan(values[pixel, j]).sum()
+            if measured == 0:
+                continue
+            count += measured
+            _pixel_value(pixel, j, geometry, x, system, residual)
+            error += _weigh(values[pixel, j], residual, weight[pixel, j])
+            _add_adjoint(pixel, j, geometry, residual, system, right)
+            _add_diagonal(pixel, j, geometry, system, diagonal)
+    return error, count
+
+
+@dataclass(frozen=True, eq=False)
+class PixelStart:
+    """Where a Gauss-Newton step begins in one view.
+
+    Parameters
+    ----------
+    system : Linearisation
+    right, diagonal : (m, 3 + K + 3) float32
+    squares : float
+        Sum of the weighted squared residuals.
+    count : int
+        Of the values.
+    """
+
+    system: Linearisation
+    right: Floats
+    diagonal: Floats
+    squares: float
+    count: int
+
+
+def _geometry(pixels: ViewPixels) -> tuple[Any, Any, Any]:
+    return pixels.first, pixels.entry, pixels.share
+
+
+def linearised(
+    pixels: ViewPixels, model: HalfVectorModel, arrays: Sequence[Floats]
+) -> PixelStart:
+    """Derivatives, weights and right side of one view's pixels about a model.
+
+    Parameters
+    ----------
+    pixels : ViewPixels
+    model : HalfVectorModel
+    arrays : sequence of ndarray
+        Of `Linearisation`, written in place; shapes by `linearisation_shapes`.
+    """
+    system = Linearisation(*arrays)
+    used = np.zeros(pixels.lights.shape[:2], np.bool_)
+    _used_entries(_geometry(pixels), pixels.values, used)
+    directions = (pixels.views, pixels.lights)
+    _derivatives(pixels.texels, *directions, used, model.arrays, system.arrays[:3])
+    x = np.zeros((len(pixels.texels), 3 + model.n_lobes + N_ROTATIONS), np.float32)
+    x[:, :3] = model.diffuse[pixels.texels]
+    x[:, 3 : 3 + model.n_lobes] = model.weights[pixels.texels]
+    right, diagonal = np.zeros_like(x), np.zeros_like(x)
+    system.weight[:] = 0
+    squares, count = _start(_geometry(pixels), pixels.values, x, system.arrays, right, diagonal)
+    return PixelStart(system, right, diagonal, squares, count)
+
+
+def linearisation_shapes(pixels: ViewPixels, n_lobes: int) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the arrays of a `Linearisation`."""
+    m, n = pixels.lights.shape[:2]
+    return (m, n), (m, n, n_lobes, 3), (m, n, N_ROTATIONS, 3), pixels.values.shape
+
+
+def normal_product(pixels: ViewPixels, system: Linearisation, x: Floats) -> Floats:
+    """A^T W A x of one view, (m, 3 + K + 3) float32."""
+    y = np.zeros_like(x)
+    _apply(_geometry(pixels), pixels.values, x, system.arrays, y)
+    return y

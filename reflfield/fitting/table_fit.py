@@ -1,0 +1,478 @@
+"""Tables of the half-vector model: least squares by conjugate gradients.
+
+A row is one measured value per channel, and the mean of one or several entries (a texel for a
+pair of directions, with its share of the row). Samples have one entry, pixels some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.field.half_vector import (
+    DIFFUSE_NODES,
+    FAST,
+    HALF_SIDE,
+    LOBE_NODES,
+    N_DIFFERENCE,
+    N_LIGHT,
+    N_PHASE,
+    N_VIEW,
+    HalfVectorModel,
+    diffuse_tap,
+    diffuse_value,
+    half_taps,
+    lobe_tap,
+    lobe_values,
+)
+from reflfield.fitting.robust_weights import TABLE_HUBER, squared_weight
+
+Floats = NDArray[np.float32]
+
+# Rows are summed in so many parts, whatever the number of threads.
+PARTS = 8
+ITERATIONS = 15
+# Smoothness of the lobes, relative to what the rows weigh; of the diffuse table.
+LOBE_SMOOTHNESS, DIFFUSE_SMOOTHNESS = 3e-4, 0.02
+# Nodes of neighbouring difference angles are tied more firmly than those of a layer.
+ACROSS_LAYERS = 3.0
+# Least value of the diffuse table, whose mean is 1.
+LEAST_DIFFUSE = 0.02
+# Tie of every node to zero, relative to what a row weighs per node.
+RIDGE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class TableRows:
+    """Rows that tables are fitted to.
+
+    Parameters
+    ----------
+    first : (n_rows + 1,) int64
+        First entry of each row.
+    texel : (n_entries,) int32
+    share : (n_entries,) float32
+    views, lights : (n_entries, 3) float32
+        Unit directions, world frame.
+    values : (n_rows, 3) float32
+        In units of white; NaN where not measured.
+    """
+
+    first: NDArray[np.int64]
+    texel: NDArray[np.int32]
+    share: Floats
+    views: Floats
+    lights: Floats
+    values: Floats
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.values)
+
+    def parts(self) -> list[slice]:
+        """Rows by parts."""
+        ends = np.linspace(0, self.n_rows, PARTS + 1).astype(int)
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Rows in the tables' nodes: taps and factors of all entries, weights of the values."""
+
+    rows: TableRows
+    lobe_node: NDArray[np.int32]
+    lobe_share: Floats
+    diffuse_node: NDArray[np.int32]
+    diffuse_share: Floats
+    factor: Floats  # (n_entries, 2): of the diffuse part and of the lobes
+    weight: Floats  # (n_rows, 3): of the squared residual
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _linearise(
+    first: Any,
+    texel: Any,
+    share: Any,
+    views: Any,
+    lights: Any,
+    values: Any,
+    model: Any,
+    taps: Any,
+    factor: Any,
+    weight: Any,
+) -> None:
+    """Taps and factors of entries; weights from the residuals of the model as it is."""
+    frames, diffuse, weights, lobes, table = model
+    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
+    part = np.zeros((lobes.shape[0], 3), np.float32)
+    shown = np.zeros(3, np.float32)
+    for row in range(len(values)):
+        shown[:] = np.float32(0.0)
+        for e in range(first[row], first[row + 1]):
+            t = texel[e]
+            at_lobe, at_diffuse, cosine, spread = half_taps(frames[t], views[e], lights[e])
+            lobe_node[e], fx, fy, fd = at_lobe
+            lobe_share[e, 0], lobe_share[e, 1], lobe_share[e, 2] = fx, fy, fd
+            diffuse_node[e], gl, gv, gp = at_diffuse
+            diffuse_share[e, 0], diffuse_share[e, 1], diffuse_share[e, 2] = gl, gv, gp
+            factor[e, 0] = share[e] * cosine
+            factor[e, 1] = share[e] * cosine * spread
+            base = factor[e, 0] * diffuse_value(table, at_diffuse)
+            lobe_values(lobes, at_lobe, factor[e, 1], part)
+            for c in range(3):
+                shown[c] += base * diffuse[t, c]
+                for k in range(lobes.shape[0]):
+                    shown[c] += weights[t, k] * part[k, c]
+        for c in range(3):
+            if np.isnan(values[row, c]):
+                continue
+            weight[row, c] = squared_weight(values[row, c], shown[c], TABLE_HUBER)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _taps_of(e: int, node: Any, share: Any) -> Any:
+    return node[e], share[e, 0], share[e, 1], share[e, 2]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _add_entry(
+    e: int, t: int, taps: Any, factor: Any, model: Any, tables: Any, out: Any
+) -> None:
+    """Add what an entry shows of tables to `out` (3,)."""
+    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
+    diffuse, weights = model
+    lobes, table = tables
+    base = factor[e, 0] * diffuse_value(table, _taps_of(e, diffuse_node, diffuse_share))
+    for c in range(3):
+        out[c] += base * diffuse[t, c]
+    at = _taps_of(e, lobe_node, lobe_share)
+    for m in range(8):
+        node, tap = lobe_tap(m, at)
+        for k in range(lobes.shape[0]):
+            scale = tap * factor[e, 1] * weights[t, k]
+            for c in range(3):
+                out[c] += scale * lobes[k, node, c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _spread_entry(
+    e: int, t: int, taps: Any, factor: Any, model: Any, residual: Any, out: Any
+) -> None:
+    """Adjoint of `_add_entry`: add a residual (3,) to tables."""
+    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
+    diffuse, weights = model
+    lobes_out, table_out = out
+    base = np.float32(0.0)
+    for c in range(3):
+        base += diffuse[t, c] * residual[c]
+    base *= factor[e, 0]
+    at = _taps_of(e, diffuse_node, diffuse_share)
+    for m in range(8):
+        node, tap = diffuse_tap(m, at)
+        table_out[node] += tap * base
+    at = _taps_of(e, lobe_node, lobe_share)
+    for m in range(8):
+        node, tap = lobe_tap(m, at)
+        for k in range(lobes_out.shape[0]):
+            scale = tap * factor[e, 1] * weights[t, k]
+            for c in range(3):
+                lobes_out[k, node, c] += scale * residual[c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _normal_product(
+    first: Any,
+    texel: Any,
+    taps: Any,
+    factor: Any,
+    weight: Any,
+    model: Any,
+    tables: Any,
+    out: Any,
+) -> None:
+    """Add A^T W A x to `out`; x and `out` are tables."""
+    shown = np.zeros(3, np.float32)
+    for row in range(len(weight)):
+        shown[:] = np.float32(0.0)
+        for e in range(first[row], first[row + 1]):
+            _add_entry(e, texel[e], taps, factor, model, tables, shown)
+        for c in range(3):
+            shown[c] *= weight[row, c]
+        for e in range(first[row], first[row + 1]):
+            _spread_entry(e, texel[e], taps, factor, model, shown, out)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _right_side(
+    first: Any,
+    texel: Any,
+    taps: Any,
+    factor: Any,
+    weight: Any,
+    model: Any,
+    values: Any,
+    out: Any,
+) -> None:
+    """Add A^T W y to `out`."""
+    shown = np.zeros(3, np.float32)
+    for row in range(len(weight)):
+        for c in range(3):
+            shown[c] = np.float32(0.0)
+            if weight[row, c] > 0:
+                shown[c] = weight[row, c] * values[row, c]
+        for e in range(first[row], first[row + 1]):
+            _spread_entry(e, texel[e], taps, factor, model, shown, out)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _diagonal(
+    first: Any, texel: Any, taps: Any, factor: Any, weight: Any, model: Any, out: Any
+) -> None:
+    """Add the diagonal of A^T W A to `out`, but for products of entries of one row."""
+    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
+    diffuse, weights = model
+    lobes_out, table_out = out
+    for row in range(len(weight)):
+        for e in range(first[row], first[row + 1]):
+            t = texel[e]
+            base = np.float32(0.0)
+            for c in range(3):
+                base += weight[row, c] * (factor[e, 0] * diffuse[t, c]) ** 2
+            for m in range(8):
+                node, tap = diffuse_tap(m, _taps_of(e, diffuse_node, diffuse_share))
+                table_out[node] += tap * tap * base
+                node, tap = lobe_tap(m, _taps_of(e, lobe_node, lobe_share))
+                for k in range(lobes_out.shape[0]):
+                    scale = (tap * factor[e, 1] * weights[t, k]) ** 2
+                    for c in range(3):
+                        lobes_out[k, node, c] += scale * weight[row, c]
+
+
+def _edges(shape: tuple[int, ...], strengths: tuple[float, ...]) -> tuple[Any, Any]:
+    """Pairs (n, 2) of neighbouring nodes of a grid and the strength of their tie."""
+    nodes = np.arange(np.prod(shape)).reshape(shape)
+    pairs, ties = [], []
+    for axis, strength in enumerate(strengths):
+        lower = np.take(nodes, range(shape[axis] - 1), axis).ravel()
+        upper = np.take(nodes, range(1, shape[axis]), axis).ravel()
+        pairs.append(np.stack([lower, upper], axis=1))
+        ties.append(np.full(len(lower), strength, np.float32))
+    return np.concatenate(pairs), np.concatenate(ties)
+
+
+LOBE_EDGES, LOBE_TIES = _edges((N_DIFFERENCE, HALF_SIDE, HALF_SIDE), (ACROSS_LAYERS, 1.0, 1.0))
+DIFFUSE_EDGES, _ = _edges((N_PHASE, N_VIEW, N_LIGHT), (1.0, 1.0, 1.0))
+
+
+def _laplacian(edges: NDArray[Any], ties: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
+    """Sum over neighbours of tie times difference; columns (n_nodes, m) apart."""
+    difference = (x[edges[:, 0]] - x[edges[:, 1]]) * ties
+    columns = [
+        np.bincount(edges[:, 0], difference[:, i], len(x))
+        - np.bincount(edges[:, 1], difference[:, i], len(x))
+        for i in range(x.shape[1])
+    ]
+    return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _TableSystem:
+    """Normal equations of the tables: rows by parts, smoothness and ridge."""
+
+    linearised: _Linearised
+    model: HalfVectorModel
+    lobe_ties: Floats  # (n_edges, K * 3)
+    diffuse_tie: float
+    ridge: float
+    pool: ThreadPoolExecutor
+
+    def _over_rows(self, add: Callable[[slice, Any], None]) -> tuple[Any, Any]:
+        """Sum of what is added by each part of the rows, in their order."""
+
+        def one(part: slice) -> tuple[Floats, Floats]:
+            out = np.zeros_like(self.model.lobes), np.zeros_like(self.model.diffuse_table)
+            add(part, out)
+            return out
+
+        found = list(self.pool.map(one, self.linearised.rows.parts()))
+        lobes = np.sum([lobes for lobes, _ in found], axis=0, dtype=np.float64)
+        return lobes, np.sum([table for _, table in found], axis=0, dtype=np.float64)
+
+    def _arguments(self, part: slice) -> tuple[Any, ...]:
+        of, rows = self.linearised, self.linearised.rows
+        taps = (of.lobe_node, of.lobe_share, of.diffuse_node, of.diffuse_share)
+        first = rows.first[part.start : part.stop + 1]
+        coefficients = (self.model.diffuse, self.model.weights)
+        return first, rows.texel, taps, of.factor, of.weight[part], coefficients
+
+    def right_side(self) -> tuple[Any, Any]:
+        """A^T W y."""
+        values = self.linearised.rows.values
+        return self._over_rows(
+            lambda part, out: _right_side(*self._arguments(part), values[part], out)
+        )
+
+    def product(self, lobes: NDArray[Any], table: NDArray[Any]) -> tuple[Any, Any]:
+        """Normal matrix times tables."""
+        single = (lobes.astype(np.float32), table.astype(np.float32))
+        lobes_out, table_out = self._over_rows(
+            lambda part, out: _normal_product(*self._arguments(part), single, out)
+        )
+        columns = np.moveaxis(lobes, 0, 1).reshape(LOBE_NODES, -1)
+        smooth = _laplacian(LOBE_EDGES, self.lobe_ties, columns)
+        lobes_out += np.moveaxis(smooth.reshape(LOBE_NODES, -1, 3), 1, 0) + self.ridge * lobes
+        ties = np.full((len(DIFFUSE_EDGES), 1), self.diffuse_tie)
+        table_out += _laplacian(DIFFUSE_EDGES, ties, table[:, None])[:, 0]
+        return lobes_out, table_out
+
+    def diagonal(self) -> tuple[Any, Any]:
+        """About the diagonal of the normal matrix, above zero."""
+        lobes, table = self._over_rows(lambda part, out: _diagonal(*self._arguments(part), out))
+        ends = [
+            np.bincount(LOBE_EDGES.ravel(), np.repeat(column, 2), LOBE_NODES)
+            for column in self.lobe_ties.T
+        ]
+        ties = np.stack(ends, axis=1).reshape(LOBE_NODES, -1, 3)
+        lobes += np.moveaxis(ties, 1, 0) + self.ridge
+        tiny = np.finfo(np.float32).tiny
+        return lobes + tiny, table + 4 * self.diffuse_tie + tiny
+
+
+def fit_tables(
+    rows: TableRows,
+    model: HalfVectorModel,
+    pool: ThreadPoolExecutor,
+    smoothness: float = LOBE_SMOOTHNESS,
+    iterations: int = ITERATIONS,
+) -> HalfVectorModel:
+    """Model with tables that fit the rows better, and normalised.
+
+    Parameters
+    ----------
+    rows : TableRows
+    model : HalfVectorModel
+        Its frames and coefficients stay, its tables are where the fit starts.
+    pool : ThreadPoolExecutor
+        Threads; the tables do not depend on their number.
+    smoothness : float
+        Of the lobes, relative to what the rows weigh.
+    iterations : int
+        Of conjugate gradients.
+
+    Returns
+    -------
+    HalfVectorModel
+        See `normalised_tables`.
+    """
+    if not rows.n_rows:
+        return model
+    linearised = _linearised(rows, model, pool)
+    system = _TableSystem(
+        linearised,
+        model,
+        _lobe_ties(rows.n_rows, model, smoothness),
+        DIFFUSE_SMOOTHNESS * rows.n_rows * _mean_square(model.diffuse) / DIFFUSE_NODES * 10,
+        RIDGE * rows.n_rows / LOBE_NODES,
+        pool,
+    )
+    lobes, table = _conjugate_gradients(system, model.shared, iterations)
+    return normalised_tables(
+        replace(
+            model,
+            lobes=np.maximum(lobes, 0).astype(np.float32),
+            diffuse_table=np.maximum(table, LEAST_DIFFUSE).astype(np.float32),
+        )
+    )
+
+
+def normalised_tables(model: HalfVectorModel) -> HalfVectorModel:
+    """Same model with a diffuse table of mean 1 and lobes whose weights have mean square 1."""
+    mean = np.float32(model.diffuse_table.mean())
+    size = np.sqrt(np.mean(np.square(model.weights, dtype=np.float64), axis=0))
+    size = np.where(size > 1e-9, size, 1.0).astype(np.float32)
+    return replace(
+        model,
+        diffuse=model.diffuse * mean,
+        diffuse_table=model.diffuse_table / mean,
+        lobes=model.lobes * size[:, None, None],
+        weights=model.weights / size,
+    )
+
+
+def _mean_square(values: Floats) -> float:
+    return float(np.mean(np.square(values, dtype=np.float64)))
+
+
+def _lobe_ties(n_rows: int, model: HalfVectorModel, smoothness: float) -> Floats:
+    """Ties of neighbouring nodes: weak where the lobe is bright, as residuals are."""
+    size = np.abs(model.lobes)
+    mean = 0.5 * (size[:, LOBE_EDGES[:, 0]] + size[:, LOBE_EDGES[:, 1]])
+    mean += 1e-3 * size.max(axis=(1, 2), keepdims=True) + 1e-6
+    square = np.mean(np.square(model.weights, dtype=np.float64), axis=0)[:, None, None]
+    strength = 30 * smoothness * n_rows * square / LOBE_NODES * 0.45**2
+    ties = strength * LOBE_TIES[:, None] / mean.astype(np.float64) ** 1.16
+    return np.moveaxis(ties, 0, 1).reshape(len(LOBE_EDGES), -1).astype(np.float32)
+
+
+def _linearised(
+    rows: TableRows, model: HalfVectorModel, pool: ThreadPoolExecutor
+) -> _Linearised:
+    n = len(rows.texel)
+    found = _Linearised(
+        rows,
+        lobe_node=np.zeros(n, np.int32),
+        lobe_share=np.zeros((n, 3), np.float32),
+        diffuse_node=np.zeros(n, np.int32),
+        diffuse_share=np.zeros((n, 3), np.float32),
+        factor=np.zeros((n, 2), np.float32),
+        weight=np.zeros((rows.n_rows, 3), np.float32),
+    )
+    taps = (found.lobe_node, found.lobe_share, found.diffuse_node, found.diffuse_share)
+
+    def one(part: slice) -> None:
+        _linearise(
+            rows.first[part.start : part.stop + 1],
+            *(rows.texel, rows.share, rows.views, rows.lights, rows.values[part]),
+            *(model.arrays, taps, found.factor, found.weight[part]),
+        )
+
+    list(pool.map(one, rows.parts()))
+    return found
+
+
+def _conjugate_gradients(
+    system: _TableSystem, start: tuple[Floats, Floats], iterations: int
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Some steps towards the solution, preconditioned by the diagonal."""
+    x = [part.astype(np.float64) for part in start]
+    diagonal = system.diagonal()
+    residual = [b - q for b, q in zip(system.right_side(), system.product(*x), strict=True)]
+    scaled = [r / d for r, d in zip(residual, diagonal, strict=True)]
+    direction = [z.copy() for z in scaled]
+    energy = _dot(residual, scaled)
+    for _ in range(iterations):
+        image = system.product(*direction)
+        curvature = _dot(direction, image)
+        if not curvature > 0:
+            break
+        step = energy / curvature
+        x = [a + step * p for a, p in zip(x, direction, strict=True)]
+        residual = [r - step * q for r, q in zip(residual, image, strict=True)]
+        scaled = [r / d for r, d in zip(residual, diagonal, strict=True)]
+        before, energy = energy, _dot(residual, scaled)
+        if not energy > 0:
+            break
+        direction = [z + energy / before * p for z, p in zip(scaled, direction, strict=True)]
+    return x[0], x[1]
+
+
+def _dot(a: Any, b: Any) -> float:
+    return float(sum(np.vdot(x, y) for x, y in zip(a, b, strict=True)))

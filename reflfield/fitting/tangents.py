@@ -1,0 +1,139 @@
+r"""Tangents from the shape of highlights.
+
+What the model leaves of a texel's samples is fitted by the strongest lobe times
+:math:`u\,(\cos 2\phi, \sin 2\phi)`, :math:`\phi` the azimuth of the half vector and
+:math:`u = q / (q + .02)`, :math:`q = \sin^2\theta_h`. The two numbers are a symmetric tensor on
+the tangent plane, which is summed over neighbours; its long axis becomes the tangent.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array
+
+from reflfield.field.half_vector import (
+    FAST,
+    HalfVectorModel,
+    diffuse_value,
+    half_taps,
+    lobe_values,
+)
+from reflfield.fitting.robust_weights import HUBER, squared_weight
+from reflfield.fitting.texel_graph import TexelGraph
+from reflfield.fitting.texel_sample_fit import Indices, SampleBlock, SampleBlocks
+
+Floats = NDArray[np.float32]
+
+# Square of the sine of the half vector's angle at which a lobe's azimuth counts by half.
+FULL_AZIMUTH = np.float32(0.02)
+# Times that the tensors are summed over neighbours.
+SMOOTHING = 6
+# Of the mean information, what a texel has at least: keeps tensors of unlit texels finite.
+LEAST_INFORMATION = 1e-6
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _moments(block: Any, texels: Any, model: Any, best: int, out: Any) -> None:
+    """Normal equations (3 of the matrix, 2 of the right side) of each texel's two numbers."""
+    first, view, light, values, views, lights = block
+    frames, diffuse, weights, lobes, table = model
+    part = np.zeros((lobes.shape[0], 3), np.float32)
+    for row in range(len(texels)):
+        t = texels[row]
+        frame = frames[t]
+        for s in range(first[row], first[row + 1]):
+            v, w = views[row, view[s]], lights[row, light[s]]
+            at_lobe, at_diffuse, cosine, spread = half_taps(frame, v, w)
+            base = cosine * diffuse_value(table, at_diffuse)
+            lobe_values(lobes, at_lobe, cosine * spread, part)
+            x, y, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for d in range(3):
+                h = v[d] + w[d]
+                square += h * h
+                x += frame[0, d] * h
+                y += frame[1, d] * h
+            sine2 = (x * x + y * y) / square + np.float32(1e-9)
+            azimuth = np.float32(1.0) / (square * (sine2 + FULL_AZIMUTH))
+            cos2, sin2 = (x * x - y * y) * azimuth, np.float32(2.0) * x * y * azimuth
+            for c in range(3):
+                if np.isnan(values[s, c]):
+                    continue
+                shown = diffuse[t, c] * base
+                for k in range(lobes.shape[0]):
+                    shown += weights[t, k] * part[k, c]
+                lobe = weights[t, best] * part[best, c]
+                factor = squared_weight(values[s, c], shown, HUBER) * lobe
+                out[row, 0] += factor * lobe * cos2 * cos2
+                out[row, 1] += factor * lobe * cos2 * sin2
+                out[row, 2] += factor * lobe * sin2 * sin2
+                out[row, 3] += factor * cos2 * (values[s, c] - shown)
+                out[row, 4] += factor * sin2 * (values[s, c] - shown)
+
+
+def with_tangents_along_highlights(
+    blocks: SampleBlocks,
+    model: HalfVectorModel,
+    graph: TexelGraph,
+    pool: ThreadPoolExecutor,
+    smoothing: int = SMOOTHING,
+) -> HalfVectorModel:
+    """Model whose frames are turned about their normals, so that x is the long axis.
+
+    Parameters
+    ----------
+    blocks : SampleBlocks
+    model : HalfVectorModel
+    graph : TexelGraph
+    pool : ThreadPoolExecutor
+    smoothing : int
+        Times that the tensors are summed over neighbours; 0 where every texel has a tangent
+        of its own.
+
+    Returns
+    -------
+    HalfVectorModel
+    """
+    strength = model.weights.mean(axis=0) * model.lobes.max(axis=(1, 2))
+    best = int(np.argmax(strength))
+
+    def one(block: SampleBlock) -> tuple[Indices, NDArray[np.float64]]:
+        out = np.zeros((len(block.texels), 5))
+        kernel = (block.first, block.view, block.light, block.values, block.views, block.lights)
+        _moments(kernel, block.texels, model.arrays, best, out)
+        return block.texels, out
+
+    moments = np.zeros((model.n_texels, 5))
+    for texels, part in blocks.map(one, pool):
+        moments[texels] = part
+    return replace(model, frames=turned_to_long_axes(model.frames, moments, graph, smoothing))
+
+
+def turned_to_long_axes(
+    frames: Floats, moments: NDArray[np.float64], graph: TexelGraph, smoothing: int
+) -> Floats:
+    """Frames (n, 3, 3) with the tangent along the long axis of the tensors of `_moments`."""
+    x, y = frames[:, 0].astype(np.float64), frames[:, 1].astype(np.float64)
+    along = x[:, :, None] * x[:, None] - y[:, :, None] * y[:, None]
+    across = x[:, :, None] * y[:, None] + y[:, :, None] * x[:, None]
+    tensor = moments[:, 3, None, None] * along + moments[:, 4, None, None] * across
+    summed = np.concatenate(
+        [tensor.reshape(-1, 9), 0.5 * (moments[:, [0]] + moments[:, [2]])], axis=1
+    )
+    around = csr_array(eye_array(graph.n_texels) + graph.adjacency)
+    for _ in range(smoothing):
+        summed = around @ summed
+        summed /= max(float(summed[:, 9].max()), np.finfo(np.float64).tiny)
+    information = np.maximum(summed[:, 9], LEAST_INFORMATION * summed[:, 9].mean())
+    tensor = summed[:, :9].reshape(-1, 3, 3) / np.maximum(information, 1e-300)[:, None, None]
+    cos2 = np.einsum("ni,nij,nj->n", x, tensor, x) - np.einsum("ni,nij,nj->n", y, tensor, y)
+    sin2 = 2.0 * np.einsum("ni,nij,nj->n", x, tensor, y)
+    angle = 0.5 * np.arctan2(sin2, cos2)[:, None]
+    tangent = np.cos(angle) * x + np.sin(angle) * y
+    normal = frames[:, 2].astype(np.float64)
+    return np.stack([tangent, np.cross(normal, tangent), normal], axis=1).astype(np.float32)

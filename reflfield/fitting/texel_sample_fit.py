@@ -1,0 +1,369 @@
+"""The half-vector model fitted to the samples of texels, block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.field.half_vector import (
+    DIFFUSE_NODES,
+    FAST,
+    N_DIFFERENCE,
+    HalfVectorModel,
+    diffuse_value,
+    half_angles,
+    half_taps,
+    lobe_values,
+)
+from reflfield.fitting.robust_weights import HUBER, squared_weight
+from reflfield.fitting.table_fit import TableRows, fit_tables
+from reflfield.observations.texel_samples import TexelSamples
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+# Where lobes begin: Gaussians of these widths in the half vector's angle, degrees, and their
+# height in units of white for the first.
+START_WIDTHS, START_HEIGHT = (12.0, 5.0, 30.0, 20.0), 0.05
+# Quantile of a texel's samples over the cosine that its diffuse colour begins with, and the
+# least cosine of those samples.
+START_QUANTILE, LEAST_START_COSINE = 0.3, 0.2
+# Tie of coefficients to their mean and median, in units of weighted squared samples.
+TIE = 1e-3
+# Rows that tables are fitted to.
+TABLE_ROWS = 300_000
+
+
+@dataclass(frozen=True, eq=False)
+class SampleBlock:
+    """Samples of some texels in units of white, one list for each texel.
+
+    Parameters
+    ----------
+    texels : (n,) int
+    first : (n + 1,) int64
+        First sample of each texel.
+    view, light : (n_samples,) int16
+    values : (n_samples, 3) float32
+        NaN where not measured.
+    views, lights : (n, k, 3) float32
+        Unit directions of each texel, world frame.
+    """
+
+    texels: Indices
+    first: NDArray[np.int64]
+    view: NDArray[np.int16]
+    light: NDArray[np.int16]
+    values: Floats
+    views: Floats
+    lights: Floats
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory."""
+        arrays = (self.view, self.light, self.values, self.views, self.lights)
+        return sum(array.nbytes for array in arrays)
+
+
+def sample_block(
+    texels: Indices, samples: TexelSamples, reliable: NDArray[np.bool_], white: float
+) -> SampleBlock:
+    """Samples that count of some texels.
+
+    Parameters
+    ----------
+    texels : (n,) int
+        Their numbers.
+    samples : TexelSamples
+    reliable : (n, n_lights) bool
+        Lights that reach the texel and its surroundings.
+    white : float
+        What 1 stands for, 1/sr.
+    """
+    t, i, j = np.nonzero(samples.seen & reliable[:, None])
+    factor = np.float32(samples.unit / white)
+    return SampleBlock(
+        texels=texels,
+        first=np.searchsorted(t, np.arange(len(texels) + 1)).astype(np.int64),
+        view=i.astype(np.int16),
+        light=j.astype(np.int16),
+        values=samples.samples[t, i, j].astype(np.float32) * factor,
+        views=samples.views,
+        lights=samples.lights,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SampleBlocks:
+    """Blocks of samples, kept in memory as far as they may.
+
+    Parameters
+    ----------
+    read : callable
+        Block of a number.
+    n_blocks : int
+    budget : int
+        Bytes that may be kept; the others are read again. No result depends on it.
+    """
+
+    read: Callable[[int], SampleBlock]
+    n_blocks: int
+    budget: int
+    _kept: dict[int, SampleBlock] = field(default_factory=dict)
+
+    def __getitem__(self, number: int) -> SampleBlock:
+        if number in self._kept:
+            return self._kept[number]
+        block = self.read(number)
+        held = sum(kept.n_bytes for kept in list(self._kept.values()))
+        if held + block.n_bytes < self.budget:
+            self._kept[number] = block
+        return block
+
+    def map(
+        self, function: Callable[[SampleBlock], Any], pool: ThreadPoolExecutor
+    ) -> list[Any]:
+        """Result of a function for every block, in their order."""
+        return list(pool.map(lambda n: function(self[n]), range(self.n_blocks)))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _sums_of_texel(
+    block: Any, row: int, texel: int, model: Any, normal: Any, right: Any, part: Any
+) -> Any:
+    """Normal equations of one texel's coefficients; weighted squares and their number."""
+    first, view, light, values, views, lights = block
+    frames, diffuse, weights, lobes, table = model
+    n_lobes, error, count = lobes.shape[0], 0.0, 0
+    for s in range(first[row], first[row + 1]):
+        at_lobe, at_diffuse, cosine, spread = half_taps(
+            frames[texel], views[row, view[s]], lights[row, light[s]]
+        )
+        base = cosine * diffuse_value(table, at_diffuse)
+        lobe_values(lobes, at_lobe, cosine * spread, part)
+        for c in range(3):
+            y = values[s, c]
+            if np.isnan(y):
+                continue
+            shown = diffuse[texel, c] * base
+            for k in range(n_lobes):
+                shown += weights[texel, k] * part[k, c]
+            w = squared_weight(y, shown, HUBER)
+            error += w * (y - shown) ** 2
+            count += 1
+            right[c] += w * base * y
+            normal[c, c] += w * base * base
+            for k in range(n_lobes):
+                right[3 + k] += w * part[k, c] * y
+                normal[c, 3 + k] += w * base * part[k, c]
+                for other in range(k, n_lobes):
+                    normal[3 + k, 3 + other] += w * part[k, c] * part[other, c]
+    return error, count
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve_non_negative(normal: Any, right: Any) -> Any:
+    """Minimum of a quadratic over non-negative numbers, by an active set that only grows."""
+    n = len(right)
+    for x in range(n):
+        for y in range(x):
+            normal[x, y] = normal[y, x]
+        normal[x, x] = normal[x, x] * 1.0001 + 1e-9
+    system, target = normal.copy(), right.copy()
+    solution = np.linalg.solve(system, target)
+    for _ in range(n):
+        if solution.min() >= 0.0:
+            break
+        for x in range(n):
+            if solution[x] < 0.0:
+                system[x, :] = 0.0
+                system[:, x] = 0.0
+                system[x, x] = 1.0
+                target[x] = 0.0
+        solution = np.linalg.solve(system, target)
+    return np.maximum(solution, 0.0)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _solve_texels(
+    block: Any, texels: Any, model: Any, centre: Any, tie: float, out: Any
+) -> Any:
+    """Coefficients (n, 3 + K) of texels; the weighted squared error before, and its count."""
+    n_lobes = model[3].shape[0]
+    part = np.zeros((n_lobes, 3), np.float32)
+    normal, right = np.zeros((3 + n_lobes, 3 + n_lobes)), np.zeros(3 + n_lobes)
+    error, count = 0.0, 0
+    for row in range(len(texels)):
+        normal[:] = 0.0
+        right[:] = 0.0
+        of_texel = _sums_of_texel(block, row, texels[row], model, normal, right, part)
+        error += of_texel[0]
+        count += of_texel[1]
+        for x in range(len(right)):
+            normal[x, x] += tie
+            right[x] += tie * centre[x]
+        out[row] = _solve_non_negative(normal, right)
+    return error, count
+
+
+def _kernel_block(block: SampleBlock) -> tuple[Any, ...]:
+    return block.first, block.view, block.light, block.values, block.views, block.lights
+
+
+def solve_coefficients(
+    blocks: SampleBlocks, model: HalfVectorModel, pool: ThreadPoolExecutor, tie: float = TIE
+) -> tuple[HalfVectorModel, float]:
+    """Non-negative ridge of the coefficients of every texel of the blocks.
+
+    Parameters
+    ----------
+    blocks : SampleBlocks
+    model : HalfVectorModel
+    pool : ThreadPoolExecutor
+    tie : float
+        To the mean colour and the median weights.
+
+    Returns
+    -------
+    model : HalfVectorModel
+    residual : float
+        Root mean square of the weighted residuals before.
+    """
+    centre = np.concatenate([model.diffuse.mean(axis=0), np.median(model.weights, axis=0)])
+
+    def one(block: SampleBlock) -> tuple[Indices, NDArray[Any], float, int]:
+        out = np.zeros((len(block.texels), len(centre)))
+        error, count = _solve_texels(
+            *(_kernel_block(block), block.texels, model.arrays, centre.astype(np.float64)),
+            *(tie, out),
+        )
+        return block.texels, out, error, count
+
+    found = blocks.map(one, pool)
+    diffuse, weights = model.diffuse.copy(), model.weights.copy()
+    for texels, coefficients, _, _ in found:
+        diffuse[texels], weights[texels] = coefficients[:, :3], coefficients[:, 3:]
+    error, count = (sum(part[i] for part in found) for i in (2, 3))
+    solved = replace(model, diffuse=diffuse, weights=weights)
+    return solved, float(np.sqrt(error / max(count, 1)))
+
+
+def start_model(frames: Floats, n_lobes: int) -> HalfVectorModel:
+    """Model with Gaussian lobes, black diffuse colours and weights of 1."""
+    n = len(frames)
+    angle = np.degrees(half_angles())
+    layers = [
+        START_HEIGHT * START_WIDTHS[0] / width * np.exp(-((angle / width) ** 2))
+        for width in START_WIDTHS[:n_lobes]
+    ]
+    lobes = np.stack([np.tile(layer.ravel(), N_DIFFERENCE) for layer in layers])
+    return HalfVectorModel(
+        frames=np.ascontiguousarray(frames, np.float32),
+        diffuse=np.zeros((n, 3), np.float32),
+        weights=np.ones((n, n_lobes), np.float32),
+        lobes=np.repeat(lobes[..., None], 3, axis=2).astype(np.float32),
+        diffuse_table=np.ones(DIFFUSE_NODES, np.float32),
+    )
+
+
+def with_start_colors(
+    blocks: SampleBlocks, model: HalfVectorModel, pool: ThreadPoolExecutor
+) -> HalfVectorModel:
+    """Model with diffuse colours from a low quantile of the samples over the cosine."""
+
+    def one(block: SampleBlock) -> tuple[Indices, Floats]:
+        colors = np.full((len(block.texels), 3), np.nan, np.float32)
+        _quantiles(_kernel_block(block), block.texels, model.frames, colors)
+        return block.texels, colors
+
+    found = blocks.map(one, pool)
+    diffuse = np.full_like(model.diffuse, np.nan)
+    for texels, colors in found:
+        diffuse[texels] = colors
+    known = np.isfinite(diffuse)
+    usual = float(np.median(diffuse[known])) if known.any() else 0.0
+    return replace(model, diffuse=np.where(known, diffuse, np.float32(usual)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _quantiles(block: Any, texels: Any, frames: Any, colors: Any) -> None:
+    """Quantile of each channel of each texel's samples over the cosine; few give none."""
+    first, _, light, values, _, lights = block
+    for row in range(len(texels)):
+        normal = frames[texels[row], 2]
+        ratios = np.zeros((first[row + 1] - first[row], 3), np.float32)
+        n = 0
+        for s in range(first[row], first[row + 1]):
+            towards = lights[row, light[s]]
+            cosine = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
+            if cosine >= LEAST_START_COSINE and not np.isnan(values[s]).any():
+                ratios[n] = values[s] / cosine
+                n += 1
+        if n > 2:
+            for c in range(3):
+                colors[row, c] = max(np.quantile(ratios[:n, c], START_QUANTILE), 0.0)
+
+
+def sample_rows(blocks: SampleBlocks, most: int, seed: int) -> TableRows:
+    """Rows for the fit of tables: at most about so many samples, drawn at random."""
+    total = sum(blocks.map(lambda block: len(block.view), ThreadPoolExecutor(1)))
+    share = min(1.0, most / max(total, 1))
+    parts = list(_drawn(blocks, share, np.random.default_rng(seed)))
+    texel, views, lights, values = (
+        np.concatenate(arrays) for arrays in zip(*parts, strict=True)
+    )
+    n = len(texel)
+    return TableRows(
+        first=np.arange(n + 1),
+        texel=texel.astype(np.int32),
+        share=np.ones(n, np.float32),
+        views=views,
+        lights=lights,
+        values=values,
+    )
+
+
+def _drawn(
+    blocks: SampleBlocks, share: float, rng: np.random.Generator
+) -> Iterator[tuple[Indices, Floats, Floats, Floats]]:
+    for number in range(blocks.n_blocks):
+        block = blocks[number]
+        chosen = np.flatnonzero(rng.random(len(block.view)) < share)
+        row = np.searchsorted(block.first, chosen, side="right") - 1
+        yield (
+            block.texels[row],
+            block.views[row, block.view[chosen]],
+            block.lights[row, block.light[chosen]],
+            block.values[chosen],
+        )
+
+
+def fit_to_samples(
+    blocks: SampleBlocks,
+    model: HalfVectorModel,
+    pool: ThreadPoolExecutor,
+    rounds: int,
+    smoothness: float,
+    seed: int = 0,
+) -> tuple[HalfVectorModel, Sequence[float]]:
+    """Rounds of tables and coefficients.
+
+    Returns
+    -------
+    model : HalfVectorModel
+    residuals : sequence of float
+        Weighted, before the coefficients of each round.
+    """
+    rows = sample_rows(blocks, TABLE_ROWS, seed)
+    residuals = []
+    for _ in range(rounds):
+        model = fit_tables(rows, model, pool, smoothness)
+        model, residual = solve_coefficients(blocks, model, pool)
+        residuals.append(residual)
+    return model, residuals

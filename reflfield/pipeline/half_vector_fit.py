@@ -1,0 +1,356 @@
+"""Fit of the half-vector model: to the samples of texels, then to the photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from reflfield.errors import InputError
+from reflfield.field.build import BaseSurface, Quantisation
+from reflfield.field.file import write_field
+from reflfield.field.half_vector import HalfVectorModel, HalfVectorOptions
+from reflfield.field.half_vector_build import build_half_vector_field
+from reflfield.field.reflectance_field import HalfVectorField
+from reflfield.field.step_search import field_of_quality, field_of_size
+from reflfield.fitting.image_fit import ImageFit, frames_with, image_step, pixel_rows
+from reflfield.fitting.pixel_system import (
+    LEAST_COVERAGE,
+    ViewPixels,
+    footprint_of,
+    linearisation_shapes,
+    view_pixels,
+)
+from reflfield.fitting.table_fit import fit_tables
+from reflfield.fitting.tangents import with_tangents_along_highlights
+from reflfield.fitting.texel_graph import TexelGraph, texel_graph
+from reflfield.fitting.texel_sample_fit import (
+    TABLE_ROWS,
+    SampleBlock,
+    SampleBlocks,
+    fit_to_samples,
+    sample_block,
+    sample_rows,
+    solve_coefficients,
+    start_model,
+    with_start_colors,
+)
+from reflfield.geometry.occlusion import depth_edges
+from reflfield.metrics.sample_residual import sample_error
+from reflfield.observations.texel_reading import LUMINANCE
+from reflfield.pipeline.cache import plain
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
+from reflfield.render.camera_rays import FieldSurface
+from reflfield.util.progress import report
+
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+
+# Texels that shape the tables before all get coefficients.
+TRAINING_TEXELS = 8192
+# Rounds of tables and coefficients of one lobe, and of several, which part slowly.
+ROUNDS, ROUNDS_OF_SEVERAL = 4, 8
+# Times that tangents are turned along the highlights.
+TANGENT_ROUNDS = 2
+# Texels and quantile of their samples' luminance that is taken for white.
+WHITE_TEXELS, WHITE_QUANTILE = 1024, 0.995
+# Rows of pixels that tables are fitted to; each has several texels.
+PIXEL_ROWS = TABLE_ROWS // 2
+# Share of the memory for samples kept, and for derivatives, which else go to files.
+SAMPLES_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 4
+# In the folder of the stage.
+MODEL, WHITE = "model.npz", "white"
+# Quantisation step of cube roots of samples over that of white, at a coarseness of a half.
+STEP = 1 / 64
+
+
+@dataclass(frozen=True, eq=False)
+class HalfVectorFit:
+    """A fit of the half-vector model in one run.
+
+    Parameters
+    ----------
+    job : Job
+    """
+
+    job: Job
+
+    @property
+    def options(self) -> HalfVectorOptions:
+        """Of the model."""
+        return self.job.options.compression.half_vector
+
+    @cached_property
+    def graph(self) -> TexelGraph:
+        """Neighbours of the texels."""
+        texels = self.job.texels
+        return texel_graph(texels.position, texels.normal)
+
+    @cached_property
+    def reliable(self) -> NDArray[np.bool_]:
+        """(n_texels, n_lights) True where no shadow's edge passes within a texel."""
+        if self.job.visibility_kind == "kept":
+            return np.ones_like(self.job.light_seen)
+        return self.graph.all_around(self.job.light_seen)
+
+    @cached_property
+    def white(self) -> float:
+        """Sample that stands for white, 1/sr."""
+        job = self.job
+        seen = job.seen_texels
+        n = min(len(seen), WHITE_TEXELS)
+        chosen = seen[np.linspace(0, len(seen) - 1, n).astype(np.intp)]
+        values = [self._block(part, 1.0).values for part in job.base_reader.blocks_of(chosen)]
+        luminance = np.concatenate(values) @ LUMINANCE if values else np.zeros(0, np.float32)
+        luminance = luminance[np.isfinite(luminance)]
+        found = float(np.quantile(luminance, WHITE_QUANTILE)) if len(luminance) else 0.0
+        return found if found > 0 else 1.0
+
+    def _block(self, texels: Indices, white: float) -> SampleBlock:
+        found = self.job.base_reader.measured(texels)
+        return sample_block(texels, found, self.reliable[texels], white)
+
+    def blocks(self, texels: Indices) -> SampleBlocks:
+        """Samples of some texels in units of white."""
+        parts = self.job.base_reader.blocks_of(texels)
+        budget = int(self.job.resources.max_memory * SAMPLES_SHARE)
+        white = self.white
+        return SampleBlocks(lambda n: self._block(parts[n], white), len(parts), budget)
+
+    def to_samples(self) -> HalfVectorModel:
+        """Model in units of white, fitted to the samples of the texels."""
+        job, n_lobes = self.job, self.options.n_lobes
+        with ThreadPoolExecutor(max(job.resources.workers, 1)) as pool:
+            blocks = self.blocks(job.seen_texels)
+            model = start_model(job.texels.local_from_world, n_lobes)
+            model = with_start_colors(blocks, model, pool)
+            rounds = ROUNDS if n_lobes == 1 else ROUNDS_OF_SEVERAL
+            some = self.blocks(job.training_texels(TRAINING_TEXELS))
+            report("functions of the half vector", 0, 2 + TANGENT_ROUNDS)
+            model, _ = fit_to_samples(
+                some, model, pool, rounds, self.options.smoothness, job.options.seed
+            )
+            report("functions of the half vector", 1, 2 + TANGENT_ROUNDS)
+            model, _ = solve_coefficients(blocks, model, pool)
+            rows = sample_rows(some, TABLE_ROWS, job.options.seed)
+            for i in range(TANGENT_ROUNDS):
+                model = with_tangents_along_highlights(blocks, model, self.graph, pool)
+                model = fit_tables(rows, model, pool, self.options.smoothness)
+                model, _ = solve_coefficients(blocks, model, pool)
+                report("functions of the half vector", 2 + i, 2 + TANGENT_ROUNDS)
+        return filled(model, job.texels.position, job.seen_texels)
+
+    def to_photographs(self, model: HalfVectorModel, folder: Path) -> ImageFit:
+        """Model in units of white, fitted to the photographs."""
+        job = self.job
+        found = ImageFit(model, np.zeros(model.n_texels), 0.0)
+        if not self.options.image_steps:
+            return found
+        with ThreadPoolExecutor(max(job.resources.workers, 1)) as pool:
+            views = self.pixels(model, pool)
+            rows = pixel_rows(views, PIXEL_ROWS, job.options.seed)
+            allocate = self.allocator(views, folder)
+            normals = job.texels.normal.astype(np.float64)
+            for i in range(self.options.image_steps):
+                report("fit to the photographs", i, self.options.image_steps)
+                found = image_step(views, model, self.graph, normals, pool, allocate)
+                model = fit_tables(rows, found.model, pool, self.options.smoothness)
+                found = replace(found, model=model)
+            report("fit to the photographs", self.options.image_steps, self.options.image_steps)
+        return found
+
+    def pixels(self, model: HalfVectorModel, pool: ThreadPoolExecutor) -> list[ViewPixels]:
+        """Pixels of all views with the texels under them, as the field will be rendered."""
+        job = self.job
+        surface = FieldSurface(self.build(model, 0.0))
+
+        def one(view: int) -> ViewPixels:
+            camera = job.training.cameras[view]
+            usable = job.view_silhouettes[view] >= LEAST_COVERAGE
+            if not job.is_plane:
+                usable &= ~depth_edges(surface.scene, camera, job.options.visibility)
+            texels = job.texels
+            under = footprint_of(surface, camera, usable, texels.position, texels.normal)
+            return view_pixels(
+                job.training, view, under, texels.position, self.reliable, self.white
+            )
+
+        return list(pool.map(one, range(job.training.n_views)))
+
+    def allocator(
+        self, views: Sequence[ViewPixels], folder: Path
+    ) -> Callable[[tuple[int, ...]], Floats]:
+        """Maker of arrays for derivatives: in memory, or in files where they are too many."""
+        shapes = [s for view in views for s in linearisation_shapes(view, self.options.n_lobes)]
+        total = 4 * sum(int(np.prod(shape)) for shape in shapes)
+        if total <= self.job.resources.max_memory * DERIVATIVES_SHARE:
+            return lambda shape: np.zeros(shape, np.float32)
+        return partial(array_in_file, folder)
+
+    def build(self, model: HalfVectorModel, step: float) -> HalfVectorField:
+        """Quantise a model in units of white on the base surface into a field."""
+        job, atlas = self.job, self.job.surface_atlas
+        surface = BaseSurface(
+            positions=atlas.positions,
+            faces=atlas.faces,
+            uv=atlas.uv,
+            texel_of_pixel=job.texels.texel_of_pixel,
+        )
+        return build_half_vector_field(
+            surface,
+            in_samples(model, self.white),
+            job.indirect_light,
+            domain=job.options.resampling.domain,  # type: ignore[arg-type]
+            visibility=job.visibility_kind,  # type: ignore[arg-type]
+            metadata=field_metadata(job, plain(job.options)),
+            quantisation=Quantisation(step),
+        )
+
+    def made(self, model: HalfVectorModel) -> HalfVectorField:
+        """Field of the size, the quality or the coarseness that was asked for."""
+        options = self.job.options.compression
+        step = self.step(options.coarseness)
+
+        def build(at: float) -> HalfVectorField:
+            return self.build(model, at)
+
+        if options.size:
+            return field_of_size(build, step, options.size)
+        if options.psnr:
+            return field_of_quality(build, self.quality, step, options.psnr)
+        return build(step)
+
+    def step(self, coarseness: float) -> float:
+        """Quantisation step of cube roots of samples."""
+        return float(2 * coarseness * STEP * np.cbrt(self.white))
+
+    def quality(self, field: HalfVectorField) -> float:
+        """LDR PSNR on the samples, dB."""
+        job = self.job
+        return sample_error(field, job.base_reader, job.seen_texels, SAMPLES_MEASURED).psnr_ldr
+
+
+def array_in_file(folder: Path, shape: tuple[int, ...]) -> Floats:
+    """Array of zeros in a file without a name, which goes with the array."""
+    if not np.prod(shape):
+        return np.zeros(shape, np.float32)
+    return np.memmap(TemporaryFile(dir=folder), np.float32, "w+", shape=shape)
+
+
+def in_samples(model: HalfVectorModel, white: float) -> HalfVectorModel:
+    """Model in 1/sr from one in units of white."""
+    unit = np.float32(white)
+    return replace(model, diffuse=model.diffuse * unit, lobes=model.lobes * unit)
+
+
+def filled(
+    model: HalfVectorModel, positions: NDArray[np.floating], seen: Indices
+) -> HalfVectorModel:
+    """Model whose texels without samples have the coefficients of the nearest that has some."""
+    missing = np.setdiff1d(np.arange(model.n_texels), seen)
+    if not len(missing) or not len(seen):
+        return model
+    diffuse, weights = model.diffuse.copy(), model.weights.copy()
+    nearest = seen[cKDTree(positions[seen]).query(positions[missing])[1]]
+    diffuse[missing], weights[missing] = diffuse[nearest], weights[nearest]
+    return replace(model, diffuse=diffuse, weights=weights)
+
+
+def check_lights(job: Job) -> None:
+    """Demand known lights.
+
+    Raises
+    ------
+    InputError
+        If they are not.
+    """
+    if not job.training.lights_known:
+        raise InputError(
+            "compression.model: 'half_vector' expected lights of known positions or "
+            "directions, received unknown ones; take 'clustered'"
+        )
+
+
+def arrays_of(model: HalfVectorModel) -> dict[str, NDArray[Any]]:
+    """Arrays of a model by name."""
+    names = ("frames", "diffuse", "weights", "lobes", "diffuse_table")
+    return dict(zip(names, model.arrays, strict=True))
+
+
+def write_model(path: Path, model: HalfVectorModel, white: float) -> None:
+    """Store a model in units of white, and what white stands for, 1/sr."""
+    arrays: dict[str, Any] = {**arrays_of(model), WHITE: np.array(white)}
+    np.savez(path, **arrays)
+
+
+def fitted_on_hull(fit: HalfVectorFit, folder: Path) -> ImageFit:
+    """Fit from nothing: to the samples, then to the photographs."""
+    check_lights(fit.job)
+    blocks = fit.job.blocks(folder)
+    stored = blocks.once("fit to the samples", lambda: arrays_of(fit.to_samples()))
+    return _to_photographs(fit, HalfVectorModel(**stored), folder)
+
+
+def fitted_on_surface(fit: HalfVectorFit, folder: Path) -> ImageFit:
+    """Fit that begins with that on the hull, with the normals of the new surface."""
+    stored: dict[str, Any] = fit.job.result("surface", MODEL)
+    white = float(stored.pop(WHITE))
+    before = in_samples(HalfVectorModel(**stored), white / fit.white)
+    normals = fit.job.texels.normal.astype(np.float64)
+    frames = frames_with(normals, before.frames[:, 0])
+    return _to_photographs(fit, replace(before, frames=frames), folder)
+
+
+def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) -> ImageFit:
+    def found() -> dict[str, NDArray[Any]]:
+        image_fit = fit.to_photographs(model, folder)
+        extra = {"information": image_fit.information, "residual": np.array(image_fit.residual)}
+        return arrays_of(image_fit.model) | extra
+
+    stored: dict[str, Any] = fit.job.blocks(folder).once("fit to the photographs", found)
+    information, residual = stored.pop("information"), float(stored.pop("residual"))
+    return ImageFit(HalfVectorModel(**stored), information, residual)
+
+
+def stored_half_vector(job: Job) -> HalfVectorModel:
+    """Model of the stage "compression" before it was quantised, in units of white."""
+    stored: dict[str, Any] = job.result("compression", MODEL)
+    del stored[WHITE]
+    return HalfVectorModel(**stored)
+
+
+def write_half_vector_field(job: Job, folder: Path) -> dict[str, Any]:
+    """Fit a half-vector model, write its field, and measure it on the samples."""
+    job = job.refined
+    fit = HalfVectorFit(job)
+    found = (fitted_on_surface if job.on_surface else fitted_on_hull)(fit, folder)
+    made = fit.made(found.model)
+    write_field(folder / "field.rfld", made)
+    write_model(folder / MODEL, found.model, fit.white)
+    size = (folder / "field.rfld").stat().st_size
+    raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
+    error = sample_error(made, job.base_reader, job.seen_texels)
+    counted = job.base_reader.count_fitted(np.flatnonzero(job.sampled.any(axis=1)))
+    return {
+        "texels fitted": len(job.seen_texels),
+        "texels that repeat another": made.n_texels - len(job.seen_texels),
+        "samples fitted": counted.fitted,
+        "samples not measured": counted.unmeasured,
+        **made.counts,
+        "field bytes": size,
+        "raw bytes": raw,
+        "compression ratio": raw / size,
+        "relative error of the samples": error.linear,
+        "relative error of their cube roots": error.cube_root,
+        "LDR PSNR of the samples, dB": error.psnr_ldr,
+        "samples measured": error.n_samples,
+    }

@@ -1,0 +1,196 @@
+"""The half-vector model: evaluation against an independent one, scale, and its file."""
+
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+from reflfield.errors import FieldFileError
+from reflfield.field.array_schemas import HALF_VECTOR_ARRAYS
+from reflfield.field.build import BaseSurface, Quantisation
+from reflfield.field.description import describe
+from reflfield.field.evaluation import evaluate, sum_lights
+from reflfield.field.file import HEADER, open_field, write_field
+from reflfield.field.half_vector import (
+    DIFFUSE_NODES,
+    HALF_SIDE,
+    LOBE_NODES,
+    N_DIFFERENCE,
+    N_LIGHT,
+    N_PHASE,
+    N_VIEW,
+    HalfVectorModel,
+)
+from reflfield.field.half_vector_build import build_half_vector_field
+from reflfield.sphere.hemisphere import softened_cosine
+
+N_TEXELS = 6
+
+
+def directions(rng, n):
+    vectors = rng.normal(size=(n, 3))
+    vectors[:, 2] = np.abs(vectors[:, 2]) + 0.4
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture
+def model():
+    rng = np.random.default_rng(5)
+    normal = directions(rng, N_TEXELS).astype(np.float64) + np.array([0, 0, 2])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    tangent = np.cross(rng.normal(size=(N_TEXELS, 3)), normal)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return HalfVectorModel(
+        frames=np.stack([tangent, np.cross(normal, tangent), normal], 1).astype(np.float32),
+        diffuse=rng.uniform(0, 1, (N_TEXELS, 3)).astype(np.float32),
+        weights=rng.uniform(0, 1, (N_TEXELS, 2)).astype(np.float32),
+        lobes=rng.uniform(0, 1, (2, LOBE_NODES, 3)).astype(np.float32),
+        diffuse_table=rng.uniform(0.5, 1.5, DIFFUSE_NODES).astype(np.float32),
+    )
+
+
+def built(model, step=0.0, **options):
+    surface = BaseSurface(
+        positions=np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32),
+        faces=np.array([[0, 1, 2], [0, 2, 3]]),
+        uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32),
+        texel_of_pixel=np.arange(N_TEXELS).reshape(2, 3),
+    )
+    return build_half_vector_field(surface, model, quantisation=Quantisation(step), **options)
+
+
+def reference(model, texels, views, lights):
+    """The formula of the module, by SciPy's interpolation in double precision."""
+    frames = model.frames[texels].astype(np.float64)
+    v, light = (np.einsum("nij,nj->ni", frames, d.astype(np.float64)) for d in (views, lights))
+    half = v + light
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    cos_d = np.clip((light * half).sum(axis=1), 0, 1)
+    knee = np.radians(4.0)
+    radius = np.arcsinh(np.arccos(np.clip(half[:, 2], 0, 1)) / knee)
+    radius /= np.arcsinh(np.pi / 2 / knee)
+    across = radius / np.linalg.norm(half[:, :2], axis=1)
+    at = np.stack([np.arccos(cos_d), half[:, 1] * across, half[:, 0] * across], axis=1)
+    axis = np.linspace(-1, 1, HALF_SIDE)
+    grid = (np.linspace(0, np.pi / 2, N_DIFFERENCE), axis, axis)
+    lobes = [
+        RegularGridInterpolator(grid, lobe.reshape(*map(len, grid), 3))(at)
+        for lobe in model.lobes.astype(np.float64)
+    ]
+    cos_l, cos_v = np.clip(light[:, 2], 0, 1), np.clip(v[:, 2], 0.05, 1)
+    grid = tuple(np.linspace(0, 1, n) for n in (N_PHASE, N_VIEW, N_LIGHT))
+    table = model.diffuse_table.astype(np.float64).reshape(*map(len, grid))
+    base = RegularGridInterpolator(grid, table)(np.stack([1 - cos_d, cos_v, cos_l], axis=1))
+    raised = np.maximum(cos_l, 0.05)
+    spread = 1 / (raised + cos_v - raised * cos_v)
+    shine = sum(model.weights[texels, k, None] * lobe for k, lobe in enumerate(lobes))
+    value = model.diffuse[texels] * base[:, None] + spread[:, None] * shine
+    return softened_cosine(light[:, 2])[:, None] * value
+
+
+def pairs(n=400):
+    rng = np.random.default_rng(11)
+    return rng.integers(0, N_TEXELS, n), directions(rng, n), directions(rng, n)
+
+
+def test_samples_are_those_of_an_independent_evaluation(model):
+    texels, views, lights = pairs()
+    exact = reference(model, texels, views, lights)
+    found = evaluate(built(model), texels, views, lights)
+    # Singles: 33 nodes over an arc hyperbolic sine of an arc cosine lose some digits near the
+    # pole; random tables differ by 1 from node to node. Frames are stored to .01 degrees.
+    np.testing.assert_allclose(found, exact, atol=0.02)
+    assert np.abs(found - exact).mean() < 1e-3
+
+
+def test_texels_that_do_not_exist_and_lights_below_give_nothing(model):
+    up = np.tile(np.float32([0, 0, 1]), (2, 1))
+    field = built(model)
+    assert not evaluate(field, [-1, -1], up, up).any()
+    assert not evaluate(field, [0, 1], up, -up).any()
+
+
+def test_a_sum_over_lights_is_the_sum_of_samples(model):
+    field = built(model)
+    rng = np.random.default_rng(3)
+    texels, views, lights = np.arange(N_TEXELS), directions(rng, N_TEXELS), directions(rng, 4)
+    power = rng.uniform(0, 1, (4, 3)).astype(np.float32)
+    summed = sum_lights(field, texels, views, lights, power)
+    each = sum(
+        evaluate(field, texels, views, np.tile(light, (N_TEXELS, 1))) * p
+        for light, p in zip(lights, power, strict=True)
+    )
+    # Sums of four terms in singles.
+    np.testing.assert_allclose(summed, each, rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_quantised_samples_scale_with_the_model(model, scale):
+    texels, views, lights = pairs(100)
+    scaled = replace(
+        model,
+        diffuse=model.diffuse * np.float32(scale),
+        lobes=model.lobes * np.float32(scale),
+    )
+    step = 0.01 * np.cbrt(scale)
+    usual = evaluate(built(model, 0.01), texels, views, lights)
+    found = evaluate(built(scaled, step), texels, views, lights)
+    # Cube roots are rounded in double precision, decoded in singles.
+    np.testing.assert_allclose(found / scale, usual, rtol=2e-2, atol=2e-3)
+
+
+def test_coarser_steps_make_smaller_files_and_larger_errors(model, tmp_path):
+    texels, views, lights = pairs()
+    exact = reference(model, texels, views, lights)
+    sizes, errors = [], []
+    for step in (0.003, 0.03, 0.2):
+        write_field(tmp_path / "a.rfld", built(model, step))
+        field = open_field(tmp_path / "a.rfld")
+        sizes.append((tmp_path / "a.rfld").stat().st_size)
+        errors.append(np.abs(evaluate(field, texels, views, lights) - exact).mean())
+    assert sizes == sorted(sizes, reverse=True)
+    assert errors == sorted(errors)
+
+
+def test_a_file_gives_back_the_field(model, tmp_path):
+    field = built(model, 0.01, metadata={"a": 1})
+    write_field(tmp_path / "a.rfld", field)
+    opened = open_field(tmp_path / "a.rfld")
+    assert opened.model == "half_vector"
+    for name in HALF_VECTOR_ARRAYS:
+        np.testing.assert_array_equal(opened.arrays[name], field.arrays[name])
+    texels, views, lights = pairs(50)
+    np.testing.assert_array_equal(
+        evaluate(opened, texels, views, lights), evaluate(field, texels, views, lights)
+    )
+    described = describe(opened)
+    assert described.options["model"] == "half_vector"
+    assert described.counts["lobes"] == 2
+
+
+def with_header(source, target, **changes):
+    """Copy of a field file whose header differs; a change to None removes an entry."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for info in old.infolist():
+            content = old.read(info)
+            if info.filename == HEADER:
+                header = json.loads(content) | changes
+                kept = {k: v for k, v in header.items() if v is not None}
+                content = json.dumps(kept).encode()
+            new.writestr(info, content)
+
+
+def test_files_of_version_3_are_clustered_fields(make_field, tmp_path):
+    write_field(tmp_path / "new.rfld", make_field())
+    with_header(tmp_path / "new.rfld", tmp_path / "old.rfld", version=3, model=None)
+    assert open_field(tmp_path / "old.rfld").model == "clustered"
+
+
+def test_an_unknown_model_is_refused(model, tmp_path):
+    write_field(tmp_path / "new.rfld", built(model))
+    with_header(tmp_path / "new.rfld", tmp_path / "other.rfld", model="splines")
+    with pytest.raises(FieldFileError, match="model: expected one of"):
+        open_field(tmp_path / "other.rfld")

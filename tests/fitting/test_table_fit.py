@@ -1,0 +1,122 @@
+"""Fit of the tables: adjoint operators, planted tables, normal form."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reflfield.field.half_vector import DIFFUSE_NODES, LOBE_NODES, evaluate_half_vector
+from reflfield.fitting import table_fit
+from reflfield.fitting.table_fit import TableRows, fit_tables, normalised_tables
+from tests.fitting.conftest import random_model, unit
+
+
+def shown(model, rows):
+    """What a model gives for the rows."""
+    entries = np.zeros((len(rows.texel), 3), np.float32)
+    evaluate_half_vector(*model.arrays, rows.texel, rows.views, rows.lights, entries)
+    return np.add.reduceat(entries * rows.share[:, None], rows.first[:-1])
+
+
+def random_rows(rng, model, n_rows, per_row=3):
+    n = n_rows * per_row
+    rows = TableRows(
+        first=np.arange(0, n + 1, per_row),
+        texel=rng.integers(0, model.n_texels, n).astype(np.int32),
+        share=rng.dirichlet(np.ones(per_row), n_rows).ravel().astype(np.float32),
+        views=unit(rng, n),
+        lights=unit(rng, n),
+        values=np.zeros((n_rows, 3), np.float32),
+    )
+    return replace(rows, values=shown(model, rows))
+
+
+def system_of(model, rows, pool):
+    linearised = table_fit._linearised(rows, model, pool)
+    ties = table_fit._lobe_ties(rows.n_rows, model, 1e-3)
+    return table_fit._TableSystem(linearised, model, ties, 0.1, 0.01, pool)
+
+
+def test_the_normal_matrix_is_symmetric_and_positive(small_rng):
+    model = random_model(small_rng)
+    rows = random_rows(small_rng, model, 200)
+    with ThreadPoolExecutor(2) as pool:
+        system = system_of(model, rows, pool)
+        a, b = (
+            (small_rng.normal(size=model.lobes.shape), small_rng.normal(size=DIFFUSE_NODES))
+            for _ in range(2)
+        )
+        image_a, image_b = system.product(*a), system.product(*b)
+    # Sums of some thousand products in singles.
+    assert table_fit._dot(image_a, b) == pytest.approx(table_fit._dot(a, image_b), rel=1e-4)
+    assert table_fit._dot(a, image_a) > 0
+
+
+def test_rows_that_the_model_explains_leave_no_gradient(small_rng):
+    model = random_model(small_rng)
+    rows = random_rows(small_rng, model, 300)
+    with ThreadPoolExecutor(1) as pool:
+        system = replace(system_of(model, rows, pool), diffuse_tie=0.0, ridge=0.0)
+        system = replace(system, lobe_ties=0 * system.lobe_ties)
+        right, image = system.right_side(), system.product(*model.shared)
+    scale = np.abs(right[0]).max()
+    np.testing.assert_allclose(image[0], right[0], atol=1e-4 * scale)
+    np.testing.assert_allclose(image[1], right[1], atol=1e-4 * np.abs(right[1]).max())
+
+
+def test_planted_tables_explain_rows_after_the_fit(small_rng):
+    model = random_model(small_rng, n=40)
+    smooth = np.exp(-np.linspace(0, 3, LOBE_NODES))[None, :, None].astype(np.float32)
+    truth = replace(model, lobes=np.repeat(np.repeat(smooth, 2, 0), 3, 2))
+    rows = random_rows(small_rng, truth, 4000)
+    begin = replace(truth, lobes=np.full_like(truth.lobes, 0.2))
+    with ThreadPoolExecutor(2) as pool:
+        found = fit_tables(rows, begin, pool, smoothness=1e-7, iterations=40)
+    before = np.abs(shown(begin, rows) - rows.values).mean()
+    # Nodes jump by e^3 from layer to layer, which no smoothness likes.
+    assert np.abs(shown(found, rows) - rows.values).mean() < 0.15 * before
+    assert found.lobes.min() >= 0
+    assert found.diffuse_table.min() > 0
+
+
+def test_tables_do_not_depend_on_the_number_of_threads(small_rng):
+    model = random_model(small_rng)
+    rows = random_rows(small_rng, model, 100)
+    begin = replace(model, lobes=0.5 * model.lobes)
+    found = []
+    for n in (1, 3):
+        with ThreadPoolExecutor(n) as pool:
+            found.append(fit_tables(rows, begin, pool, iterations=3).lobes)
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_values_that_were_not_measured_do_not_count(small_rng):
+    model = random_model(small_rng)
+    rows = random_rows(small_rng, model, 100)
+    values = rows.values.copy()
+    values[::2, 1] = np.nan
+    begin = replace(model, lobes=0.5 * model.lobes)
+    with ThreadPoolExecutor(1) as pool:
+        found = fit_tables(replace(rows, values=values), begin, pool, iterations=3)
+    assert np.isfinite(found.lobes).all()
+
+
+def test_the_normal_form_changes_no_sample(small_rng):
+    model = random_model(small_rng)
+    rows = random_rows(small_rng, model, 50)
+    found = normalised_tables(model)
+    assert found.diffuse_table.mean() == pytest.approx(1, rel=1e-6)
+    assert np.mean(found.weights**2, axis=0) == pytest.approx(np.ones(2), rel=1e-6)
+    # Two roundings of singles more.
+    np.testing.assert_allclose(shown(found, rows), rows.values, rtol=1e-5)
+
+
+def test_no_rows_leave_the_model_as_it_is(small_rng):
+    model = random_model(small_rng)
+    rows = random_rows(small_rng, model, 4)
+    none = TableRows(
+        np.zeros(1, np.int64), rows.texel[:0], rows.share[:0], rows.views[:0],
+        rows.lights[:0], rows.values[:0],
+    )  # fmt: skip
+    assert fit_tables(none, model, ThreadPoolExecutor(1)) is model

@@ -1,0 +1,169 @@
+"""Coefficients and tangents from samples: planted ones found, none negative, few samples."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reflfield.field.half_vector import evaluate_half_vector, half_angles
+from reflfield.fitting.tangents import with_tangents_along_highlights
+from reflfield.fitting.texel_graph import TexelGraph, texel_graph
+from reflfield.fitting.texel_sample_fit import (
+    SampleBlock,
+    SampleBlocks,
+    fit_to_samples,
+    solve_coefficients,
+    start_model,
+    with_start_colors,
+)
+from tests.fitting.conftest import frames_about, random_model, unit
+
+N_VIEWS, N_LIGHTS = 6, 12
+
+
+def block_of(rng, model, texels=None, views=None, lights=None):
+    """All samples of all texels of a model, in one block."""
+    texels = np.arange(model.n_texels) if texels is None else texels
+    n, k = len(texels), N_VIEWS * N_LIGHTS
+    views = unit(rng, n, N_VIEWS) if views is None else views
+    lights = unit(rng, n, N_LIGHTS) if lights is None else lights
+    view, light = (x.ravel() for x in np.mgrid[:N_VIEWS, :N_LIGHTS])
+    row = np.repeat(np.arange(n), k)
+    view, light = np.tile(view, n), np.tile(light, n)
+    values = np.zeros((n * k, 3), np.float32)
+    evaluate_half_vector(
+        *model.arrays,
+        texels[row].astype(np.int32),
+        views[row, view],
+        lights[row, light],
+        values,
+    )
+    return SampleBlock(
+        texels=texels,
+        first=np.arange(0, n * k + 1, k),
+        view=view.astype(np.int16),
+        light=light.astype(np.int16),
+        values=values,
+        views=views,
+        lights=lights,
+    )
+
+
+def blocks_of(*blocks):
+    return SampleBlocks(lambda n: blocks[n], len(blocks), 1 << 30)
+
+
+def without_samples(block, row):
+    """The block with no sample of one texel."""
+    kept = np.ones(len(block.view), bool)
+    kept[block.first[row] : block.first[row + 1]] = False
+    counts = np.diff(block.first)
+    counts[row] = 0
+    return replace(
+        block,
+        first=np.concatenate([[0], np.cumsum(counts)]),
+        view=block.view[kept],
+        light=block.light[kept],
+        values=block.values[kept],
+    )
+
+
+def test_planted_coefficients_are_found(small_rng):
+    truth = random_model(small_rng, 20)
+    block = block_of(small_rng, truth)
+    begin = replace(truth, diffuse=0 * truth.diffuse + 0.5, weights=0 * truth.weights + 0.5)
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            begin, _ = solve_coefficients(blocks_of(block), begin, pool, tie=1e-9)
+    # The factor 1.0001 on the diagonal, times the condition of two random lobes.
+    np.testing.assert_allclose(begin.diffuse, truth.diffuse, atol=0.02)
+    np.testing.assert_allclose(begin.weights, truth.weights, atol=0.05)
+
+
+def test_coefficients_are_never_negative(small_rng):
+    model = random_model(small_rng, 20)
+    block = block_of(small_rng, model)
+    noise = small_rng.normal(size=block.values.shape).astype(np.float32)
+    with ThreadPoolExecutor(1) as pool:
+        found, _ = solve_coefficients(
+            blocks_of(replace(block, values=block.values * 0.1 + noise)), model, pool
+        )
+    assert found.diffuse.min() >= 0
+    assert found.weights.min() >= 0
+    assert (found.weights == 0).any()
+
+
+def test_texels_without_samples_get_the_usual_coefficients(small_rng):
+    model = random_model(small_rng, 5)
+    block = without_samples(block_of(small_rng, model), 2)
+    with ThreadPoolExecutor(1) as pool:
+        found, _ = solve_coefficients(blocks_of(block), model, pool)
+        colored = with_start_colors(blocks_of(block), model, pool)
+    np.testing.assert_allclose(found.diffuse[2], model.diffuse.mean(axis=0), rtol=1e-3)
+    assert np.isfinite(colored.diffuse).all()
+
+
+@pytest.mark.parametrize("n_lobes", [1, 3])
+def test_rounds_explain_samples_of_a_known_material(small_rng, n_lobes):
+    truth = start_model(frames_about(small_rng, 40), 1)
+    shine = np.exp(-((half_angles() / np.radians(20)) ** 2)).ravel()
+    lobes = np.tile(shine, 6)[None, :, None].repeat(3, 2).astype(np.float32)
+    diffuse = small_rng.uniform(0.1, 0.5, (40, 3)).astype(np.float32)
+    truth = replace(truth, diffuse=diffuse, lobes=lobes)
+    blocks = blocks_of(block_of(small_rng, truth))
+    with ThreadPoolExecutor(2) as pool:
+        model = with_start_colors(blocks, start_model(truth.frames, n_lobes), pool)
+        found, residuals = fit_to_samples(blocks, model, pool, 4, 3e-4)
+    assert residuals[-1] < 0.5 * residuals[0]
+    assert found.lobes.min() >= 0
+
+
+def test_tangents_turn_to_the_long_axis_of_highlights(small_rng):
+    # A lobe twice as long along x; the frames that are given are turned at random.
+    truth = start_model(np.tile(np.eye(3, dtype=np.float32), (30, 1, 1)), 1)
+    axis = np.linspace(-1, 1, 33)
+    shine = np.exp(-(axis[None, :] ** 2 / 0.5 + axis[:, None] ** 2 / 0.1)).ravel()
+    lobes = np.tile(shine, 6)[None, :, None].repeat(3, 2).astype(np.float32)
+    truth = replace(truth, lobes=lobes)
+    block = block_of(small_rng, truth)
+    angle = small_rng.uniform(-1, 1, 30)
+    turned = np.zeros((30, 3, 3), np.float32)
+    turned[:, 0] = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    turned[:, 2] = [0, 0, 1]
+    turned[:, 1] = np.cross(turned[:, 2], turned[:, 0])
+    round_lobe = np.exp(-(axis[None, :] ** 2 + axis[:, None] ** 2) / 0.25).ravel()
+    lobes = np.tile(round_lobe, 6)[None, :, None].repeat(3, 2).astype(np.float32)
+    graph = TexelGraph(30, np.stack([np.arange(29), np.arange(1, 30)], axis=1))
+    with ThreadPoolExecutor(2) as pool:
+        found = with_tangents_along_highlights(
+            blocks_of(block), replace(truth, frames=turned, lobes=lobes), graph, pool
+        )
+    off = np.degrees(np.arccos(np.clip(np.abs(found.frames[:, 0, 0]), 0, 1)))
+    assert np.median(off) < 5
+    np.testing.assert_allclose(found.frames[:, 2], turned[:, 2], atol=1e-6)
+
+
+def test_blocks_beyond_the_budget_are_read_again(small_rng):
+    block = block_of(small_rng, random_model(small_rng))
+    reads = []
+
+    def read(n):
+        reads.append(n)
+        return block
+
+    kept, dropped = SampleBlocks(read, 1, 1 << 30), SampleBlocks(read, 1, 1)
+    for blocks in (kept, kept, dropped, dropped):
+        assert blocks[0] is block
+    assert reads == [0, 0, 0]
+
+
+def test_a_graph_joins_texels_that_face_the_same_way():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 0, 0.1]])
+    normals = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, -1]])
+    graph = texel_graph(points, normals)
+    assert graph.pairs.tolist() == [[0, 1], [1, 2]]
+    assert graph.all_around(np.array([True, True, False, True])).tolist() == [
+        True, False, False, True,
+    ]  # fmt: skip
+    np.testing.assert_allclose(graph.laplacian() @ np.ones(4), 0)

@@ -1,0 +1,81 @@
+"""Whole runs with the half-vector model on the tiny capture."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from reflfield.capture.readers import open_capture
+from reflfield.errors import InputError
+from reflfield.field.clustered_pca import CompressionOptions
+from reflfield.field.file import open_field
+from reflfield.field.half_vector import HalfVectorOptions
+from reflfield.geometry.mesh import read_ply
+from reflfield.geometry.uv_atlas import AtlasOptions
+from reflfield.geometry.visual_hull import HullOptions
+from reflfield.options import HoldOut, Resources
+from reflfield.pipeline.pipeline_options import ComparisonOptions, PipelineOptions
+from reflfield.pipeline.stages import run
+from reflfield.render.renderer import RenderOptions
+
+OPTIONS = PipelineOptions(
+    hull=HullOptions(resolution=32, n_triangles=2000),
+    atlas=AtlasOptions(resolution=64),
+    compression=CompressionOptions(
+        model="half_vector", half_vector=HalfVectorOptions(n_lobes=1)
+    ),
+    relighting=RenderOptions(samples_per_pixel=1),
+    comparison=ComparisonOptions(rate_distortion=True),
+)
+HELD_OUT = HoldOut(views=1, lights=1)
+# Of the mean over held-out photographs; a satin ball of 20 pixels across is shown at 27 dB.
+LEAST_PSNR = 22.0
+
+
+def half_vector_run(capture, out, options=OPTIONS, workers=1):
+    resources = Resources(workers=workers)
+    return run(open_capture(capture), out, options, hold_out=HELD_OUT, resources=resources)
+
+
+@pytest.fixture(scope="module")
+def made(tiny_capture, tmp_path_factory):
+    """Folder of a whole run."""
+    out = tmp_path_factory.mktemp("half_vector")
+    half_vector_run(tiny_capture, out)
+    return out
+
+
+def test_a_run_makes_field_surface_and_report(made):
+    field = open_field(made / "field.rfld")
+    assert field.model == "half_vector"
+    assert (made / "report" / "index.html").is_file()
+    assert not (made / "stages" / "alignment").exists()
+    hull, surface = read_ply(made / "hull.ply"), read_ply(made / "surface.ply")
+    assert surface.watertight == hull.watertight
+    assert len(surface.faces) == len(hull.faces)
+
+
+def test_its_field_shows_held_out_photographs(made):
+    metrics = json.loads((made / "metrics.json").read_text())
+    assert metrics["mean"]["psnr_ldr"] > LEAST_PSNR
+
+
+def test_it_is_the_same_bytes_for_any_number_of_workers(made, tiny_capture, tmp_path):
+    half_vector_run(tiny_capture, tmp_path, workers=3)
+    for name in ("field.rfld", "surface.ply"):
+        assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
+
+
+def test_the_hull_stays_where_no_surface_is_asked_for(tiny_capture, tmp_path):
+    compression = replace(
+        OPTIONS.compression,
+        half_vector=HalfVectorOptions(n_lobes=1, surface_from_normals=False, image_steps=0),
+    )
+    half_vector_run(tiny_capture, tmp_path, replace(OPTIONS, compression=compression))
+    assert open_field(tmp_path / "field.rfld").model == "half_vector"
+    assert not (tmp_path / "surface.ply").exists()
+
+
+def test_a_field_without_alignment_has_nothing_to_compare():
+    with pytest.raises(InputError, match=r"comparison\.without_alignment: expected"):
+        replace(OPTIONS, comparison=ComparisonOptions(without_alignment=True))
