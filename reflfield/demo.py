@@ -53,7 +53,7 @@ from reflfield.alignment import align
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.field.sample_fit import SampleFitOptions, fit_basis
-from reflfield.observations.texel_samples import TexelSamples, rooted_samples
+from reflfield.observations.texel_samples import TexelSamples, transformed_samples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 directions = HemisphereGrid(7).directions
@@ -68,7 +68,7 @@ model = ClusteredModel(
     np.ones((1, 9, 9, 6), np.float32),
     np.ones((1, 1, 1)),
 )
-samples = rooted_samples(texels, frames, (3, 3), "cube_root")
+samples = transformed_samples(texels, frames, (3, 3), "cube_root")
 fit_basis(lambda some: samples, model, np.arange(2), 1000, SampleFitOptions(rounds=1))
 with ThreadPoolExecutor(1) as pool:
     solve_coefficients(samples, model.cluster, model, pool, bounded=True)

@@ -23,7 +23,7 @@ from reflfield.field.sample_sums import (
     parts,
     touched_nodes,
 )
-from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, RootedSamples
+from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, TransformedSamples
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -122,7 +122,7 @@ def _accumulate(
 class BasisProblem:
     """Normal equations of mean and basis for fixed coefficients."""
 
-    rooted: RootedSamples
+    samples: TransformedSamples
     cluster: Ints
     coefficients: Floats
     smoothness: float
@@ -134,7 +134,7 @@ class BasisProblem:
         def part_sum(part: slice) -> Floats:
             out = np.zeros_like(table)
             _accumulate(
-                kernel_samples(self.rooted, part),
+                kernel_samples(self.samples, part),
                 self.cluster[part],
                 self.coefficients[part],
                 table,
@@ -150,13 +150,18 @@ class BasisProblem:
 
     def samples_per_node(self, n_clusters: int, n_nodes: int) -> NDArray[np.float32]:
         """Mean weight of a pair of nodes in each cluster; scales the regularisation."""
-        rooted = self.rooted
+        samples = self.samples
         weight = np.einsum(
-            "ti,ij,tj->t", rooted.view_weights, rooted.pairs, rooted.light_weights
+            "ti,ij,tj->t",
+            samples.view_weights,
+            samples.pairs,
+            samples.light_weights,
         )
-        if rooted.has_gaps:
-            pairs = rooted.pairs * rooted.measured().mean(axis=3, dtype=np.float32)
-            weight = np.einsum("ti,tij,tj->t", rooted.view_weights, pairs, rooted.light_weights)
+        if samples.has_gaps:
+            pairs = samples.pairs * samples.measured().mean(axis=3, dtype=np.float32)
+            weight = np.einsum(
+                "ti,tij,tj->t", samples.view_weights, pairs, samples.light_weights
+            )
         total = np.bincount(self.cluster, weight, minlength=n_clusters)
         return np.maximum(total / n_nodes, 1e-6).astype(np.float32)
 

@@ -23,7 +23,7 @@ from reflfield.field.sample_sums import (
     parts,
     touched_nodes,
 )
-from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, RootedSamples
+from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, TransformedSamples
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -182,7 +182,7 @@ def _solve_coefficients(
 
 
 def solve_coefficients(
-    rooted: RootedSamples,
+    samples: TransformedSamples,
     cluster: Ints,
     model: ClusteredModel,
     pool: ThreadPoolExecutor,
@@ -193,7 +193,7 @@ def solve_coefficients(
 
     Parameters
     ----------
-    rooted : RootedSamples
+    samples : TransformedSamples
         Samples of n texels.
     cluster : (n,) int32
     model : ClusteredModel
@@ -218,7 +218,7 @@ def solve_coefficients(
 
     def solve(part: slice) -> None:
         _solve_coefficients(
-            kernel_samples(rooted, part),
+            kernel_samples(samples, part),
             cluster[part],
             model.table,
             model.precision,

@@ -20,7 +20,7 @@ from reflfield.alignment.rotation_steps import scale_vector as shrink
 from reflfield.alignment.spline_targets import FAST
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.observations.texel_reading import TexelReader
-from reflfield.observations.texel_samples import POWERS, root
+from reflfield.observations.texel_samples import POWERS, transform
 from reflfield.sphere.hemisphere import place_directions, softened_cosine_of
 from reflfield.util.validation import check_shape
 
@@ -269,7 +269,7 @@ def refined_frames(
     samples = measured.samples.astype(np.float32) * np.float32(measured.unit)
     frames = reader.local_from_world[texels].astype(np.float64)
     _refine(
-        root(samples, reader.options.domain),
+        transform(samples, reader.options.domain),
         (measured.views.astype(np.float64), measured.lights.astype(np.float64)),
         (measured.view_seen, measured.light_seen),
         measured.pairs,

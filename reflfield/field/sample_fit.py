@@ -25,11 +25,11 @@ from reflfield.errors import InputError
 from reflfield.field.basis import BasisProblem
 from reflfield.field.clustered_model import ClusteredModel, normalised
 from reflfield.field.coefficients import solve_coefficients
-from reflfield.observations.texel_samples import RootedSamples
+from reflfield.observations.texel_samples import TransformedSamples
 from reflfield.util.progress import report
 from reflfield.util.validation import check_ranges
 
-Reader = Callable[[NDArray[np.intp]], RootedSamples]
+Reader = Callable[[NDArray[np.intp]], TransformedSamples]
 
 # Largest values of options; beyond them a run takes days, or no machine holds the tables.
 MOST = {"rounds": 1000, "iterations": 10_000, "max_bytes": 1 << 40, "fineness": 16}
@@ -103,7 +103,7 @@ def fit_basis(
     Parameters
     ----------
     read : callable
-        From texel indices to their `RootedSamples` in the aligned frames.
+        From texel indices to their `TransformedSamples` in the aligned frames.
     initial : ClusteredModel
         Clusters, coefficients, mean and basis to start from (grid fit).
     observed : (k,) int
@@ -137,7 +137,7 @@ def fit_basis(
 
 
 def _alternate(
-    rooted: RootedSamples,
+    samples: TransformedSamples,
     model: ClusteredModel,
     chosen: NDArray[np.intp],
     options: SampleFitOptions,
@@ -148,10 +148,10 @@ def _alternate(
     for done in range(options.rounds):
         report("fitting the basis to the samples", done, options.rounds)
         problem = BasisProblem(
-            rooted, cluster, model.coefficients[chosen], options.smoothness, pool
+            samples, cluster, model.coefficients[chosen], options.smoothness, pool
         )
         model = replace(model, table=problem.solve(model.table, options.iterations))
-        solved, squares = solve_coefficients(rooted, cluster, model, pool)
+        solved, squares = solve_coefficients(samples, cluster, model, pool)
         noise = float(squares[:, 0].sum() / max(squares[:, 1].sum(), 1e-30))
         coefficients = model.coefficients.copy()
         coefficients[chosen] = solved

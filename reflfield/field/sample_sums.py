@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.observations.texel_samples import Channels, RootedSamples
+from reflfield.observations.texel_samples import Channels, TransformedSamples
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -28,7 +28,7 @@ N_PARTS = 8
 
 
 class KernelSamples(NamedTuple):
-    """Arrays of some texels' samples as the kernels take them; see `RootedSamples`."""
+    """Arrays of some texels' samples as the kernels take them; see `TransformedSamples`."""
 
     values: Floats
     view_nodes: Ints
@@ -41,18 +41,18 @@ class KernelSamples(NamedTuple):
     channels: Channels
 
 
-def kernel_samples(rooted: RootedSamples, part: slice) -> KernelSamples:
+def kernel_samples(samples: TransformedSamples, part: slice) -> KernelSamples:
     """Samples of some texels for the kernels."""
     return KernelSamples(
-        values=rooted.values[part],
-        view_nodes=rooted.view_taps[0][part],
-        view_taps=rooted.view_taps[1][part],
-        light_nodes=rooted.light_taps[0][part],
-        light_taps=rooted.light_taps[1][part],
-        view_weights=rooted.view_weights[part],
-        light_weights=rooted.light_weights[part],
-        pairs=rooted.pairs,
-        channels=rooted.channels[part],
+        values=samples.values[part],
+        view_nodes=samples.view_taps[0][part],
+        view_taps=samples.view_taps[1][part],
+        light_nodes=samples.light_taps[0][part],
+        light_taps=samples.light_taps[1][part],
+        view_weights=samples.view_weights[part],
+        light_weights=samples.light_weights[part],
+        pairs=samples.pairs,
+        channels=samples.channels[part],
     )
 
 

@@ -28,7 +28,7 @@ from reflfield.observations.texel_samples import (
     ALL_CHANNELS,
     POWERS,
     Channels,
-    RootedSamples,
+    TransformedSamples,
     interpolation_matrices,
 )
 
@@ -164,12 +164,14 @@ class Nodes:
         return np.minimum(product, self.pair_support)
 
 
-def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -> Nodes:
+def resample(
+    transformed: TransformedSamples, sides: tuple[int, int], smoothness: float
+) -> Nodes:
     """Smooth functions on the nodes that explain the samples, texel by texel.
 
     Parameters
     ----------
-    rooted : RootedSamples
+    transformed : TransformedSamples
     sides : (int, int)
         Sides of the view and light grids.
     smoothness : float
@@ -186,17 +188,17 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
     observed only as far as photographed ones lie near them. Of a texel of which some values
     were not measured each channel is resampled by itself, from its own views and lights.
     """
-    n, n_nodes = len(rooted.values), (sides[0] ** 2, sides[1] ** 2)
+    n, n_nodes = len(transformed.values), (sides[0] ** 2, sides[1] ** 2)
     values = np.zeros((n, *n_nodes, 3), np.float32)
     supports = (np.zeros((n, n_nodes[0]), np.float32), np.zeros((n, n_nodes[1]), np.float32))
     _resample_texels(
-        rooted.values,
-        (rooted.view_taps, rooted.light_taps),
-        (rooted.view_weights, rooted.light_weights),
+        transformed.values,
+        (transformed.view_taps, transformed.light_taps),
+        (transformed.view_weights, transformed.light_weights),
         (prior_covariance(sides[0], smoothness), prior_covariance(sides[1], smoothness)),
         (1 if sides[0] == 1 else 4, 1 if sides[1] == 1 else 4),
-        rooted.pairs > 0,
-        rooted.channels,
+        transformed.pairs > 0,
+        transformed.channels,
         FILLING_SWEEPS,
         values,
         supports,
@@ -204,11 +206,11 @@ def resample(rooted: RootedSamples, sides: tuple[int, int], smoothness: float) -
     for support in supports:
         np.minimum(support, 1.0, out=support)
         support[support < LEAST_SUPPORT] = 0.0
-    if rooted.pairs.all() and not rooted.has_gaps:
+    if transformed.pairs.all() and not transformed.has_gaps:
         return Nodes(values, *supports)
-    to_views = interpolation_matrices(rooted.view_taps, sides[0])
-    to_lights = interpolation_matrices(rooted.light_taps, sides[1])
-    return Nodes(values, *supports, _pair_support(rooted, to_views, to_lights))
+    to_views = interpolation_matrices(transformed.view_taps, sides[0])
+    to_lights = interpolation_matrices(transformed.light_taps, sides[1])
+    return Nodes(values, *supports, _pair_support(transformed, to_views, to_lights))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -435,20 +437,22 @@ def _take(
     return n_missing
 
 
-def _pair_support(rooted: RootedSamples, to_views: Floats, to_lights: Floats) -> Floats:
+def _pair_support(
+    transformed: TransformedSamples, to_views: Floats, to_lights: Floats
+) -> Floats:
     """Interpolation weight (n, n_view_nodes, n_light_nodes[, 3]) of what was measured."""
-    seen = (rooted.view_weights > 0)[:, :, None] & (rooted.light_weights > 0)[:, None]
-    counted = (seen * rooted.pairs)[..., None]
-    if rooted.has_gaps:
-        counted = counted * rooted.measured()
+    seen = (transformed.view_weights > 0)[:, :, None] & (transformed.light_weights > 0)[:, None]
+    counted = (seen * transformed.pairs)[..., None]
+    if transformed.has_gaps:
+        counted = counted * transformed.measured()
     support = apply_both(np.swapaxes(to_views, 1, 2), np.swapaxes(to_lights, 1, 2), counted)
     support = np.where(support < LEAST_SUPPORT, np.float32(0), support)
-    if not rooted.has_gaps:
+    if not transformed.has_gaps:
         return support[..., 0]
     # Where a photograph shows the texel but says too little, what its other samples continue to
     # counts a little: of directions that are clipped on all texels nothing else is known.
     known = np.asarray(counted.any(axis=(1, 2)))[:, None, None]
-    shown = (seen * rooted.pairs)[..., None]
+    shown = (seen * transformed.pairs)[..., None]
     reach = apply_both(np.swapaxes(to_views, 1, 2), np.swapaxes(to_lights, 1, 2), shown)
     continued = CONTINUED * np.minimum(reach, np.float32(1.0)) * (reach >= LEAST_SUPPORT)
     return np.maximum(support, continued * known).astype(np.float32)

@@ -14,12 +14,12 @@ from reflfield.observations.image_projection import directions_of, facing_irradi
 from reflfield.observations.store import Bools, ObservationStore, Observed
 from reflfield.observations.texel_samples import (
     POWERS,
-    RootedSamples,
     TexelSamples,
+    TransformedSamples,
     above_horizon,
     local_directions,
-    root,
-    rooted_samples,
+    transform,
+    transformed_samples,
 )
 from reflfield.sphere.hemisphere import softened_cosine
 
@@ -262,10 +262,12 @@ class TexelReader:
             total += int(np.count_nonzero(nothing & seen))
         return total
 
-    def rooted(self, texels: Indices) -> RootedSamples:
-        """Samples (in the domain), taps and weights of some texels."""
+    def transformed(self, texels: Indices) -> TransformedSamples:
+        """Transformed samples, taps and weights of some texels."""
         frames = np.ascontiguousarray(self.local_from_world[texels], np.float32)
-        return rooted_samples(self.measured(texels), frames, self.sides, self.options.domain)
+        return transformed_samples(
+            self.measured(texels), frames, self.sides, self.options.domain
+        )
 
     def luminance(self, texels: Indices) -> LocalLuminance:
         """Luminance of the samples of some texels, as measured, and where they stand.
@@ -303,16 +305,16 @@ class TexelReader:
         for i in range(views.shape[1]):
             used = views[t, i] & pairs[i, j]
             values = samples[t[used], i, j[used]].astype(np.float32)
-            rooted = root(values * np.float32(self.store.unit), self.options.domain)
-            measured = ~np.isnan(rooted)
+            transformed = transform(values * np.float32(self.store.unit), self.options.domain)
+            measured = ~np.isnan(transformed)
             weights[t[used], j[used]] += measured
-            total[t[used], j[used]] += np.where(measured, rooted, np.float32(0.0))
+            total[t[used], j[used]] += np.where(measured, transformed, np.float32(0.0))
         means = total / np.maximum(weights, np.float32(1.0))
         return Shade(means.astype(np.float32), weights, lights)
 
     def nodes(self, texels: Indices) -> Nodes:
         """Texels resampled onto the nodes of their frames."""
-        return resample(self.rooted(texels), self.sides, self.options.smoothness)
+        return resample(self.transformed(texels), self.sides, self.options.smoothness)
 
 
 def _mean_over(samples: Floats, axis: int) -> Floats:

@@ -1,8 +1,8 @@
-r"""Samples of texels in the domain of the factorization, with directions in their own frames.
+r"""Samples of texels, transformed for the factorization, with directions in their own frames.
 
-The domain is the cube root by default. Samples are divided by the softened cosine of the light
-before, and stand between the nodes of the hemisphere grids of each texel's frame: a few nodes
-and weights (taps) per direction.
+The transform is the cube root by default. Samples are divided by the softened cosine of the
+light before, and stand between the nodes of the hemisphere grids of each texel's frame: a few
+nodes and weights (taps) per direction.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ POWERS = {"cube_root": 3.0, "square_root": 2.0, "linear": 1.0}
 LOWEST_VIEW = -0.2
 
 
-def root(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
-    """Samples into the domain of the factorization; the sign is kept.
+def transform(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
+    """Transform samples into the domain of the factorization; the sign is kept.
 
     Examples
     --------
-    >>> root(np.array([8.0, -8.0]), "cube_root"), root(np.array([9.0, -9.0]), "square_root")
-    (array([ 2., -2.]), array([ 3., -3.]))
+    >>> transform(np.array([8.0, -8.0]), "cube_root")
+    array([ 2., -2.])
+    >>> transform(np.array([9.0, -9.0]), "square_root")
+    array([ 3., -3.])
     """
     if domain == "linear":
         return values
@@ -40,13 +42,15 @@ def root(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
     return np.sign(values) * np.sqrt(np.abs(values))
 
 
-def unroot(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
-    """Inverse of `root`.
+def inverse_transform(values: NDArray[np.floating], domain: str) -> NDArray[np.floating]:
+    """Inverse of `transform`.
 
     Examples
     --------
-    >>> unroot(np.array([2.0, -2.0]), "cube_root"), unroot(np.array([-3.0]), "square_root")
-    (array([ 8., -8.]), array([-9.]))
+    >>> inverse_transform(np.array([2.0, -2.0]), "cube_root")
+    array([ 8., -8.])
+    >>> inverse_transform(np.array([-3.0]), "square_root")
+    array([-9.])
     """
     if domain == "linear":
         return values
@@ -104,7 +108,7 @@ def local_directions(local_from_world: Directions, directions: Directions) -> Di
     return directions @ np.swapaxes(local_from_world, 1, 2)
 
 
-# Bits of `RootedSamples.channels`, and all of them.
+# Bits of `TransformedSamples.channels`, and all of them.
 CHANNEL_BITS = np.array([1, 2, 4], np.uint8)
 ALL_CHANNELS = 7
 
@@ -115,13 +119,13 @@ def all_channels() -> Channels:
 
 
 @dataclass(frozen=True, eq=False)
-class RootedSamples:
-    """Samples in the domain with interpolation taps and weights in the texels' frames.
+class TransformedSamples:
+    """Transformed samples with interpolation taps and weights in the texels' frames.
 
     Parameters
     ----------
     values : (n, n_views, n_lights, 3) float32
-        Samples over softened cosine, in the domain; zero where they do not count.
+        Transformed samples over softened cosine; zero where they do not count.
     view_taps, light_taps : tuple of ((n, k, 4) int32, (n, k, 4) float32)
         Nodes and weights.
     view_weights, light_weights : (n, k) float32
@@ -152,10 +156,10 @@ class RootedSamples:
         return (self.channels[..., None] & CHANNEL_BITS) > 0
 
 
-def rooted_samples(
+def transformed_samples(
     texels: TexelSamples, local_from_world: Floats, sides: tuple[int, int], domain: str
-) -> RootedSamples:
-    """Bring samples into the domain and find their taps in the texels' frames.
+) -> TransformedSamples:
+    """Transform samples and find their taps in the texels' frames.
 
     A sample y = s D^-1(u) with cosine s; an error of D^-1(u) counts s times, so in the
     domain with power p the weight of u is ``s ** (2 / p)``.
@@ -171,7 +175,7 @@ def rooted_samples(
 
     Returns
     -------
-    RootedSamples
+    TransformedSamples
 
     Notes
     -----
@@ -187,7 +191,7 @@ def rooted_samples(
     if sides[1] > 1:
         cosine = softened_cosine(light[..., 2]).astype(np.float32)
     safe = np.where(light_seen, cosine, np.float32(1.0))
-    # A third of the samples count at a dome: only these are brought into the domain.
+    # A third of the samples count at a dome: only these are transformed.
     t, i, j = np.nonzero(view_seen[:, :, None] & light_seen[:, None] & texels.pairs)
     values = np.zeros(texels.samples.shape, np.float32)
     ratio = texels.samples[t, i, j].astype(np.float32) * np.float32(texels.unit)
@@ -198,8 +202,8 @@ def rooted_samples(
         channels = np.zeros(values.shape[:3], np.uint8)
         channels[t, i, j] = ~unmeasured @ CHANNEL_BITS
         ratio[unmeasured] = 0.0
-    values[t, i, j] = root(ratio, domain)
-    return RootedSamples(
+    values[t, i, j] = transform(ratio, domain)
+    return TransformedSamples(
         values=values,
         view_taps=direction_taps(view, sides[0]),
         light_taps=direction_taps(light, sides[1]),
@@ -213,7 +217,7 @@ def rooted_samples(
 def above_horizon(
     view_seen: Bools, light_seen: Bools, view: Floats, light: Floats, sides: tuple[int, int]
 ) -> tuple[Bools, Bools]:
-    """Which seen views and lights count in the texels' frames; see `rooted_samples`.
+    """Which seen views and lights count in the texels' frames; see `transformed_samples`.
 
     Parameters
     ----------

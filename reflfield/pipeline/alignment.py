@@ -16,7 +16,7 @@ from reflfield.alignment.model_arrays import arrays_of_model, model_of_arrays
 from reflfield.alignment.model_fit import FitOptions, fit_model
 from reflfield.alignment.sample_sources import GriddedSamples, ScatteredSource
 from reflfield.observations.texel_reading import LUMINANCE, TexelReader
-from reflfield.observations.texel_samples import unroot
+from reflfield.observations.texel_samples import inverse_transform
 from reflfield.pipeline.context import Job
 from reflfield.sphere.harmonic_projection import safe_band_limit
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
@@ -192,7 +192,7 @@ class CompletedLuminance:
         """Samples at the nodes, (k, n_view_nodes, n_light_nodes)."""
         columns = self.mean + self.coefficients[rows] @ self.basis.T
         nodes = columns.reshape(len(rows), *self.shape[1:], 3)
-        values = unroot(nodes, self.domain) @ LUMINANCE
+        values = inverse_transform(nodes, self.domain) @ LUMINANCE
         if self.sides[1] > 1:
             z = HemisphereGrid(self.sides[1]).directions[:, 2]
             values = values * softened_cosine(z).astype(np.float32)

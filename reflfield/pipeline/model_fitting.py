@@ -154,7 +154,7 @@ def _fitted_once(
 
     def basis() -> dict[str, NDArray[Any]]:
         found = fit_basis(
-            reader.rooted,
+            reader.transformed,
             model,
             job.seen_texels,
             reader.sample_bytes_per_texel,
@@ -203,7 +203,7 @@ def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]
     """Coefficients of some texels in the basis of the model."""
     with ThreadPoolExecutor(1) as pool:
         found, _ = solve_coefficients(
-            context.reader.rooted(texels),
+            context.reader.transformed(texels),
             context.model.cluster[texels],
             context.model,
             pool,

@@ -21,8 +21,8 @@ from reflfield.observations.frame_resampling import apply_both
 from reflfield.observations.texel_samples import (
     direction_taps,
     interpolation_matrices,
+    inverse_transform,
     local_directions,
-    unroot,
 )
 from reflfield.pipeline.context import Job
 from reflfield.sphere.hemisphere import softened_cosine
@@ -180,6 +180,6 @@ def completed_samples(
         interpolation_matrices(direction_taps(d, side), side)
         for d, side in zip(local, sides, strict=True)
     )
-    values = np.maximum(unroot(apply_both(at_views, at_lights, nodes), domain), 0)
+    values = np.maximum(inverse_transform(apply_both(at_views, at_lights, nodes), domain), 0)
     cosine = softened_cosine(local[1][..., 2]) if sides[1] > 1 else np.ones(lights.shape[:2])
     return (values * cosine[:, None, :, None]).astype(np.float32)

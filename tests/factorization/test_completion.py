@@ -306,9 +306,7 @@ def test_bad_matrices_are_refused():
         complete(np.ones((3, 0)), rank=1)
     with pytest.raises(InputError, match="finite values where observed, received inf in row 1"):
         complete(np.array([[1.0, 2.0], [3.0, np.inf]]), rank=1)
-    with pytest.raises(
-        ShapeError, match=r"expected shape \(n_rows, .* received list"
-    ):
+    with pytest.raises(ShapeError, match=r"expected shape \(n_rows, .* received list"):
         complete([[1.0, 2.0]], rank=1)
     with pytest.raises(InputError, match="expected None with a source"):
         complete(MatrixSource(np.ones((3, 2))), np.ones((3, 2), bool), rank=1)

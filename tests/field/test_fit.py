@@ -12,7 +12,7 @@ from reflfield.field.bounds import MOST_OF_MEAN
 from reflfield.field.clustered_model import ClusteredModel, normalised, of_usual_size
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.field.sample_fit import SampleFitOptions, fit_basis
-from reflfield.observations.texel_samples import CHANNEL_BITS, RootedSamples, all_channels
+from reflfield.observations.texel_samples import CHANNEL_BITS, TransformedSamples, all_channels
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 SIDES = (3, 3)
@@ -43,7 +43,7 @@ def empty_samples(rng, n, n_views, n_lights, sides=SIDES, *, gaps=False):
     channels = all_channels()
     if gaps:
         channels = (rng.random((n, n_views, n_lights, 3)) < 2 / 3) @ CHANNEL_BITS
-    return RootedSamples(
+    return TransformedSamples(
         values=np.zeros((n, n_views, n_lights, 3), np.float32),
         view_taps=random_taps(rng, n, n_views, sides[0]),
         light_taps=random_taps(rng, n, n_lights, sides[1]),
@@ -104,7 +104,7 @@ def measured(samples, model, rng, sigma):
 
 def part(samples, texels):
     """Samples of some texels, as a reader gives them."""
-    return RootedSamples(
+    return TransformedSamples(
         values=samples.values[texels],
         view_taps=tuple(a[texels] for a in samples.view_taps),
         light_taps=tuple(a[texels] for a in samples.light_taps),
@@ -549,7 +549,7 @@ def bounded_case(rng, spread):
     ]
     every = np.ones((n, n_directions), np.float32)
     values = 1 + spread * rng.normal(size=(n, n_directions, n_directions, 3))
-    samples = RootedSamples(
+    samples = TransformedSamples(
         values=values.astype(np.float32),
         view_taps=taps[0],
         light_taps=taps[1],

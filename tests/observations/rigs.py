@@ -9,7 +9,7 @@ import numpy as np
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.capture import Capture, Photograph
 from reflfield.capture.lights import Light
-from reflfield.observations.texel_samples import RootedSamples, TexelSamples
+from reflfield.observations.texel_samples import TexelSamples, TransformedSamples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 
@@ -65,7 +65,7 @@ def texel_samples(rng, n, n_views, n_lights, **changes):
     return TexelSamples(**(arguments | changes))
 
 
-def rooted(rng, n, n_views, n_lights, sides, *, pairs=None, values=None):
+def transformed(rng, n, n_views, n_lights, sides, *, pairs=None, values=None):
     """Samples in the domain at random directions with random weights, a fifth of them zero."""
 
     def taps(k, side):
@@ -80,7 +80,7 @@ def rooted(rng, n, n_views, n_lights, sides, *, pairs=None, values=None):
 
     if values is None:
         values = rng.normal(size=(n, n_views, n_lights, 3)).astype(np.float32)
-    return RootedSamples(
+    return TransformedSamples(
         values=values,
         view_taps=taps(n_views, sides[0]),
         light_taps=taps(n_lights, sides[1]),

@@ -16,10 +16,14 @@ from reflfield.observations.texel_reading import (
     TexelReader,
     luminance_of,
 )
-from reflfield.observations.texel_samples import CHANNEL_BITS, local_directions, rooted_samples
+from reflfield.observations.texel_samples import (
+    CHANNEL_BITS,
+    local_directions,
+    transformed_samples,
+)
 from reflfield.sphere.hemisphere import softened_cosine
 
-from .rigs import dome, hemisphere, rooted, texel_samples, tilted_frames
+from .rigs import dome, hemisphere, texel_samples, tilted_frames, transformed
 from .test_resampling import SOLVE, weighted_solution
 
 N = 12
@@ -73,7 +77,7 @@ def test_grey_under_coloured_lamps_is_grey(reader_of, n_lights, tolerance):
 
 def test_node_is_observed_in_the_colours_of_the_lamps_near_it(reader_of):
     reader = reader_of(4, 3, [0.3, 0.2, 0.1])
-    read = reader.rooted(np.arange(N))
+    read = reader.transformed(np.arange(N))
     weights = reader.nodes(np.arange(N)).weights
     assert weights.shape == (N, 9, 25, 3)
     for t, m, c in np.ndindex(N, 25, 3):
@@ -111,7 +115,7 @@ def test_what_is_clipped_everywhere_is_continued_and_counts_a_little(rng):
     samples = whole.samples.copy()
     samples[:, :, :3, 1], samples[1, ..., 2] = np.nan, np.nan
     frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
-    found = rooted_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
+    found = transformed_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
     nodes = resample(found, (1, 5), 0.03)
     weights = nodes.weights[:, 0]
     zenith = 12  # of 5 x 5, amid the first lights
@@ -125,7 +129,7 @@ def test_what_is_clipped_everywhere_is_continued_and_counts_a_little(rng):
 def test_values_not_measured_against_a_weighted_solve(rng, monkeypatch, rounding):
     """Clipped pixels, anywhere: each channel by itself."""
     smooth = np.array([1.0, 2.0, 0.5]) + 0.2 * rng.normal(size=(2, 12, 10, 3))
-    whole = rooted(rng, 2, 12, 10, (5, 5), values=smooth.astype(np.float32))
+    whole = transformed(rng, 2, 12, 10, (5, 5), values=smooth.astype(np.float32))
     measured = rng.random((2, 12, 10, 3)) < 0.8
     values = np.where(measured, whole.values, np.float32(77))
     gaps = replace(whole, values=values, channels=measured @ CHANNEL_BITS)
@@ -183,6 +187,6 @@ def test_samples_of_which_nothing_was_measured_are_counted(reader_of):
     changed = create_samples(reader.store.location, N, 4, 6)
     changed[:] = values
     found = reader.count_fitted(np.arange(N))
-    n_counted = int((reader.rooted(np.array([2])).light_weights > 0).sum())
+    n_counted = int((reader.transformed(np.array([2])).light_weights > 0).sum())
     assert found.unmeasured == n_counted
     assert found.fitted == usual.fitted - n_counted

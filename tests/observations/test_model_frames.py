@@ -68,7 +68,7 @@ def planted(model, tmp_path, rng):
     )
     stored = create_samples(tmp_path / "store", N, 14, 15)
     stored[:] = 0
-    taps = reader.rooted(np.arange(N))
+    taps = reader.transformed(np.arange(N))
     parts = model.table.reshape(2, 49, 49, 2, 3)[model.cluster]
     nodes = parts[..., 0, :] + model.coefficients[:, None, None] * parts[..., 1, :]
     lights = reader.luminance(np.arange(N)).lights

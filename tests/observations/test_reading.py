@@ -8,7 +8,7 @@ from reflfield.observations.frame_resampling import ResamplingOptions
 from reflfield.observations.image_projection import pairs_photographed
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.observations.texel_reading import NodeColumns, TexelReader, grid_sides
-from reflfield.observations.texel_samples import root
+from reflfield.observations.texel_samples import transform
 from reflfield.sphere.hemisphere import HemisphereGrid
 
 from .rigs import dome, tilted_frames
@@ -62,7 +62,7 @@ class TestSides:
 class TestReader:
     def test_values_are_samples_over_cosines(self, reader, rng):
         texels = np.array([31, 4])
-        got = reader.rooted(texels)
+        got = reader.transformed(texels)
         stored = reader.store.read(texels).astype(float)
         for i, t in enumerate(texels):
             for j, light in enumerate(reader.capture.lights):
@@ -79,7 +79,7 @@ class TestReader:
         capture = dome(5, 4, missing={(2, 3)})
         reader = reader_of(capture, rng.random((9, 5, 4, 3)), views=views, lights=lights)
         texels = np.array([8, 1, 3, 5])
-        got = reader.rooted(texels)
+        got = reader.transformed(texels)
         assert np.array_equal(got.view_weights > 0, views[texels])
         assert not got.light_weights[~lights[texels]].any()
         assert got.pairs.sum() == 19
@@ -93,15 +93,17 @@ class TestReader:
             Light("l1", "spot", direction=[1, 0, 0], **aimed),
         )
         reader = reader_of(dome(3, 2, lights=lights), rng.random((4, 3, 2, 3)))
-        assert (reader.rooted(np.arange(4)).light_weights > 0).tolist() == [[True, False]] * 4
+        assert (reader.transformed(np.arange(4)).light_weights > 0).tolist() == [
+            [True, False]
+        ] * 4
 
     def test_unknown_light(self, reader_of, rng):
         samples = rng.random((5, 6, 1, 3))
         capture = dome(6, 1, lights=(Light("l0", "unknown"),))
         reader = reader_of(capture, samples, domain="cube_root", sides=(5, 1))
-        got = reader.rooted(np.arange(5))
+        got = reader.transformed(np.arange(5))
         stored = samples.astype(np.float16).astype(np.float32)
-        assert np.array_equal(got.values, root(stored, "cube_root"))
+        assert np.array_equal(got.values, transform(stored, "cube_root"))
         assert (got.light_weights == 1).all()
         assert reader.nodes(np.arange(5)).values.shape == (5, 25, 1, 3)
 
@@ -109,7 +111,7 @@ class TestReader:
         """A function of the local light alone is found again in any frames."""
         capture = dome(4, 120)
         flat = reader_of(capture, np.zeros((10, 4, 120, 3)), sides=(1, 3))
-        local = flat.rooted(np.arange(10))
+        local = flat.transformed(np.arange(10))
         slope = HemisphereGrid(3).directions @ [0.3, 0.2, 0.0] + 1
         nodes, weights = local.light_taps
         values = (slope[nodes] * weights).sum(axis=2)
@@ -131,7 +133,7 @@ class TestReader:
     def test_sizes(self, reader):
         assert reader.n_texels == 40
         assert reader.n_pairs == 9 * 25
-        values = reader.rooted(np.arange(40)).values.nbytes
+        values = reader.transformed(np.arange(40)).values.nbytes
         assert reader.sample_bytes_per_texel * 40 > values
 
 

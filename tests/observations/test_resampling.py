@@ -19,13 +19,13 @@ from reflfield.observations.frame_resampling import (
 from reflfield.observations.texel_samples import (
     LOWEST_VIEW,
     POWERS,
-    RootedSamples,
+    TransformedSamples,
     direction_taps,
     interpolation_matrices,
+    inverse_transform,
     local_directions,
-    root,
-    rooted_samples,
-    unroot,
+    transform,
+    transformed_samples,
 )
 from reflfield.sphere.hemisphere import HORIZON_SOFTNESS, HemisphereGrid
 
@@ -33,10 +33,10 @@ from .rigs import (
     dense_interpolation,
     hemisphere,
     interpolated,
-    rooted,
     smoothness_precision,
     texel_samples,
     tilted_frames,
+    transformed,
 )
 
 SMOOTHNESS = 0.03
@@ -69,15 +69,15 @@ class TestSides:
 class TestDomain:
     @given(st.floats(-1e12, 1e12), st.sampled_from(sorted(POWERS)))
     def test_unroot_inverts_root(self, value, domain):
-        back = unroot(root(np.array([value]), domain), domain)
+        back = inverse_transform(transform(np.array([value]), domain), domain)
         assert np.allclose(back, value, rtol=1e-14, atol=1e-300)  # a few eps
 
     @pytest.mark.parametrize(("domain", "power"), POWERS.items())
     def test_is_odd_and_a_power(self, domain, power, rounding):
         x = np.array([0.0, 1e-12, 0.3, 1.0, 5.0, 1e12])
         tolerance = rounding(np.float64) * x ** (1 / power)
-        assert (np.abs(root(x, domain) - x ** (1 / power)) <= tolerance).all()
-        assert np.array_equal(root(-x, domain), -root(x, domain))
+        assert (np.abs(transform(x, domain) - x ** (1 / power)) <= tolerance).all()
+        assert np.array_equal(transform(-x, domain), -transform(x, domain))
 
 
 class TestRooting:
@@ -87,7 +87,7 @@ class TestRooting:
         texels = texel_samples(
             rng, 1, 1, 3, samples=samples, lights=directions_at(1.0, 0.5, 0.0)
         )
-        got = rooted_samples(texels, identity(1), (1, 5), domain)
+        got = transformed_samples(texels, identity(1), (1, 5), domain)
         # The softened cosine of a light on the horizon is a quarter of the softness.
         cosine = np.array([1.0, 0.5, HORIZON_SOFTNESS / 4])
         assert np.allclose(got.light_weights, cosine ** (2 / power), rtol=1e-6)
@@ -100,8 +100,8 @@ class TestRooting:
         """A small step dy of the sample is a weighted step of one size in the domain."""
         z, y, step = np.array([0.9, 0.5, 0.2]), 0.3, 1e-6
         for domain, power in POWERS.items():
-            at = root(z * y / z, domain)
-            moved = root((z * y + z ** (1 - 1 / power) * step) / z, domain) - at
+            at = transform(z * y / z, domain)
+            moved = transform((z * y + z ** (1 - 1 / power) * step) / z, domain) - at
             weighted = moved * np.sqrt(z ** (2 / power))
             # Second order in the step.
             assert np.ptp(weighted) < 1e-4 * weighted.max()
@@ -110,25 +110,25 @@ class TestRooting:
         cut = -0.5 * HORIZON_SOFTNESS
         lights = directions_at(0.3, cut + 1e-3, cut - 1e-3, -HORIZON_SOFTNESS, -0.9)
         texels = texel_samples(rng, 1, 2, 5, lights=lights)
-        got = rooted_samples(texels, identity(1), (5, 5), "cube_root")
+        got = transformed_samples(texels, identity(1), (5, 5), "cube_root")
         assert (got.light_weights[0] > 0).tolist() == [True, True, False, False, False]
         assert np.isfinite(got.values).all()
-        kept = rooted_samples(texels, identity(1), (5, 1), "cube_root")
+        kept = transformed_samples(texels, identity(1), (5, 1), "cube_root")
         assert (kept.light_weights == 1).all()
         assert np.array_equal(kept.values, np.cbrt(texels.samples))
 
     def test_views_far_below_the_horizon_do_not_count(self, rng):
         views = directions_at(0.5, -0.1, LOWEST_VIEW + 1e-3, LOWEST_VIEW - 1e-3, -1.0)
         texels = texel_samples(rng, 1, 5, 2, views=views)
-        got = rooted_samples(texels, identity(1), (5, 5), "cube_root")
+        got = transformed_samples(texels, identity(1), (5, 5), "cube_root")
         assert got.view_weights[0].tolist() == [1, 1, 1, 0, 0]
-        fixed = rooted_samples(texels, identity(1), (1, 5), "cube_root")
+        fixed = transformed_samples(texels, identity(1), (1, 5), "cube_root")
         assert fixed.view_weights[0].tolist() == [1, 1, 1, 1, 1]
 
     def test_unseen_directions_have_no_weight(self, rng):
         view_seen, light_seen = np.array([[True, False]]), np.array([[False, True, True]])
         texels = texel_samples(rng, 1, 2, 3, view_seen=view_seen, light_seen=light_seen)
-        got = rooted_samples(texels, identity(1), (5, 5), "linear")
+        got = transformed_samples(texels, identity(1), (5, 5), "linear")
         assert ((got.view_weights > 0) == view_seen).all()
         assert ((got.light_weights > 0) == light_seen).all()
 
@@ -142,8 +142,10 @@ class TestRooting:
             lights=local_directions(turn, texels.lights),
         )
         frames = tilted_frames(rng, 4)
-        one = rooted_samples(texels, frames, (7, 5), "cube_root")
-        other = rooted_samples(turned, frames @ np.swapaxes(turn, 1, 2), (7, 5), "cube_root")
+        one = transformed_samples(texels, frames, (7, 5), "cube_root")
+        other = transformed_samples(
+            turned, frames @ np.swapaxes(turn, 1, 2), (7, 5), "cube_root"
+        )
         at_one = interpolation_matrices(one.view_taps, 7)
         at_other = interpolation_matrices(other.view_taps, 7)
         # Directions agree to float32; the map to the square has a root at the zenith.
@@ -161,14 +163,14 @@ class TestRooting:
 class TestInterpolation:
     @pytest.mark.parametrize("side", [1, 2, 5])
     def test_matrix_applies_the_taps(self, rng, side, rounding):
-        samples = rooted(rng, 3, 9, 1, (side, 1))
+        samples = transformed(rng, 3, 9, 1, (side, 1))
         matrices = interpolation_matrices(samples.view_taps, side)
         assert np.allclose(matrices, dense_interpolation(samples.view_taps, side), atol=1e-7)
         assert np.abs(matrices.sum(axis=2) - 1).max() < rounding(np.float32)
 
     def test_adjoint(self, rng, rounding):
         """<A X B^T, Y> = <X, A^T Y B> with the products applied the other way round."""
-        samples = rooted(rng, 4, 6, 5, (5, 3))
+        samples = transformed(rng, 4, 6, 5, (5, 3))
         a = interpolation_matrices(samples.view_taps, 5)
         b = interpolation_matrices(samples.light_taps, 3)
         nodes = rng.normal(size=(4, 25, 9, 3)).astype(np.float32)
@@ -188,7 +190,7 @@ class TestInterpolation:
         )
 
     def test_samples_between_nodes(self, rng, rounding):
-        samples = rooted(rng, 3, 7, 6, (5, 3))
+        samples = transformed(rng, 3, 7, 6, (5, 3))
         nodes = rng.normal(size=(3, 25, 9, 3)).astype(np.float32)
         got = apply_both(
             interpolation_matrices(samples.view_taps, 5),
@@ -219,7 +221,7 @@ def on_the_hemisphere(n, k, side):
     taps = direction_taps(np.tile(hemisphere(k, 0.0), (n, 1, 1)).astype(np.float32), side)
     weights = np.ones((n, k), np.float32)
     values = np.zeros((n, k, k, 3), np.float32)
-    return RootedSamples(values, taps, taps, weights, weights, np.ones((k, k), np.float32))
+    return TransformedSamples(values, taps, taps, weights, weights, np.ones((k, k), np.float32))
 
 
 def dense_solution(samples, sides, smoothness, texel):
@@ -261,7 +263,7 @@ class TestSolve:
     @pytest.mark.reference
     @pytest.mark.parametrize("sides", [(5, 5), (7, 3), (1, 5), (5, 1), (1, 1), (2, 2)])
     def test_against_dense_normal_equations(self, rng, sides, rounding):
-        samples = rooted(rng, 3, 12, 10, sides)
+        samples = transformed(rng, 3, 12, 10, sides)
         nodes = resample(samples, sides, SMOOTHNESS)
         for t in range(3):
             expected = dense_solution(samples, sides, SMOOTHNESS, t)
@@ -274,7 +276,9 @@ class TestSolve:
     def test_missing_pairs_against_a_weighted_solve(self, rng, monkeypatch, rounding):
         pairs = (rng.random((12, 10)) < 0.8).astype(np.float32)
         smooth = np.array([[1.0, 2.0, 0.5]]) + 0.2 * rng.normal(size=(2, 12, 10, 3))
-        samples = rooted(rng, 2, 12, 10, (5, 5), pairs=pairs, values=smooth.astype(np.float32))
+        samples = transformed(
+            rng, 2, 12, 10, (5, 5), pairs=pairs, values=smooth.astype(np.float32)
+        )
         expected = np.stack([weighted_solution(samples, (5, 5), 0.3, t) for t in range(2)])
         monkeypatch.setattr(frame_resampling, "FILLING_SWEEPS", 300)
         converged = resample(samples, (5, 5), 0.3)
@@ -291,7 +295,7 @@ class TestSolve:
 
     def test_missing_values_are_not_read(self, rng):
         pairs = (rng.random((8, 9)) < 0.7).astype(np.float32)
-        samples = rooted(rng, 2, 8, 9, (5, 5), pairs=pairs)
+        samples = transformed(rng, 2, 8, 9, (5, 5), pairs=pairs)
         other = replace(samples, values=np.where(pairs[..., None] > 0, samples.values, 77.0))
         one, two = (resample(s, (5, 5), SMOOTHNESS) for s in (samples, other))
         assert np.array_equal(one.values, two.values)
@@ -352,7 +356,7 @@ class TestSupport:
             samples=np.ones((1, 3, 2, 3)),
         )
         got = resample(
-            rooted_samples(texels, identity(1), (5, 5), "linear"), (5, 5), SMOOTHNESS
+            transformed_samples(texels, identity(1), (5, 5), "linear"), (5, 5), SMOOTHNESS
         )
         expected = np.zeros(25)
         expected[[12, 0]] = 1
@@ -373,14 +377,14 @@ class TestSupport:
             rng, 1, 2, 2, views=nodes[:, chosen], lights=nodes[:, chosen], pairs=pairs
         )
         got = resample(
-            rooted_samples(texels, identity(1), (5, 5), "linear"), (5, 5), SMOOTHNESS
+            transformed_samples(texels, identity(1), (5, 5), "linear"), (5, 5), SMOOTHNESS
         )
         assert np.allclose(got.weights[0][np.ix_(chosen, chosen)], pairs, atol=1e-3)
 
     def test_a_photograph_of_each_light_from_a_view_of_its_own(self, rng):
         """The diagonal of the pairs: far less observed than the product, and so it says."""
         texels = texel_samples(rng, 2, 16, 16)
-        every = rooted_samples(texels, identity(2), (5, 5), "cube_root")
+        every = transformed_samples(texels, identity(2), (5, 5), "cube_root")
         diagonal = replace(every, pairs=np.eye(16, dtype=np.float32))
         one, two = (resample(s, (5, 5), SMOOTHNESS).weights for s in (every, diagonal))
         assert one.mean() > 0.3
@@ -389,7 +393,7 @@ class TestSupport:
 
     def test_lonely_traces_do_not_count(self, rng):
         """A node with 5 % of a sample was not observed."""
-        samples = rooted(rng, 1, 1, 1, (2, 2))
+        samples = transformed(rng, 1, 1, 1, (2, 2))
         taps = (
             np.array([[[0, 1, 2, 3]]], np.int32),
             np.array([[[0.05, 0.95, 0, 0]]], np.float32),
@@ -413,7 +417,9 @@ class TestInvariance:
                 },
             )
             return resample(
-                rooted_samples(part, frames[chosen], (5, 5), "cube_root"), (5, 5), SMOOTHNESS
+                transformed_samples(part, frames[chosen], (5, 5), "cube_root"),
+                (5, 5),
+                SMOOTHNESS,
             )
 
         whole = run(np.arange(30))
@@ -431,7 +437,7 @@ class TestInvariance:
         scaled = replace(texels, samples=texels.samples * np.float32(scale))
         frames = tilted_frames(rng, 3)
         one, two = (
-            resample(rooted_samples(t, frames, (5, 5), domain), (5, 5), SMOOTHNESS)
+            resample(transformed_samples(t, frames, (5, 5), domain), (5, 5), SMOOTHNESS)
             for t in (texels, scaled)
         )
         factor = np.float64(scale) ** (1 / POWERS[domain])
@@ -446,21 +452,25 @@ class TestDegenerate:
     def test_nothing_seen(self, rng, what):
         texels = texel_samples(rng, 2, 4, 5)
         texels = replace(texels, **{what: np.zeros_like(getattr(texels, what))})
-        got = resample(rooted_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03)
+        got = resample(
+            transformed_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03
+        )
         assert not got.values.any()
         assert not got.weights.any()
 
     def test_all_lights_below_the_horizon(self, rng):
         lights = -np.tile(hemisphere(5), (2, 1, 1)).astype(np.float32)
         texels = texel_samples(rng, 2, 4, 5, lights=lights)
-        got = resample(rooted_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03)
+        got = resample(
+            transformed_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03
+        )
         assert not got.values.any()
         assert not got.weights.any()
 
     def test_one_sample_continues_as_a_constant(self, rng):
         """Alone against the prior it holds everywhere, to the prior's own weight."""
         texels = texel_samples(rng, 1, 1, 1, samples=np.full((1, 1, 1, 3), 0.5, np.float32))
-        samples = rooted_samples(texels, identity(1), (5, 5), "linear")
+        samples = transformed_samples(texels, identity(1), (5, 5), "linear")
         got = resample(samples, (5, 5), 0.03)
         expected = samples.values[0, 0, 0, 0]
         # At the sample P / (P + 1 / w) for each direction, P about 1e3 / 0.03 / 25 and the
@@ -473,13 +483,17 @@ class TestDegenerate:
 
     def test_no_photograph_at_all(self, rng):
         texels = texel_samples(rng, 2, 4, 5, pairs=np.zeros((4, 5), bool))
-        got = resample(rooted_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03)
+        got = resample(
+            transformed_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03
+        )
         assert not got.values.any()
         assert not got.weights.any()
 
     def test_zeros_stay_zero(self, rng):
         texels = texel_samples(rng, 2, 4, 5, samples=np.zeros((2, 4, 5, 3), np.float16))
-        got = resample(rooted_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03)
+        got = resample(
+            transformed_samples(texels, identity(2), (5, 5), "cube_root"), (5, 5), 0.03
+        )
         assert not got.values.any()
         assert got.weights.any()
 
@@ -488,13 +502,15 @@ class TestDegenerate:
         lights = directions_at(-0.5 * HORIZON_SOFTNESS + 1e-6, 1.0)
         texels = texel_samples(rng, 1, 4, 2, samples=samples, lights=lights)
         for domain in POWERS:
-            got = resample(rooted_samples(texels, identity(1), (5, 5), domain), (5, 5), 0.03)
+            got = resample(
+                transformed_samples(texels, identity(1), (5, 5), domain), (5, 5), 0.03
+            )
             assert np.isfinite(got.values).all()
 
     @pytest.mark.parametrize("sides", [(1, 5), (5, 1), (1, 1)])
     def test_directions_that_do_not_vary(self, rng, sides):
         texels = texel_samples(rng, 2, 1 if sides[0] == 1 else 8, 1 if sides[1] == 1 else 8)
-        got = resample(rooted_samples(texels, identity(2), sides, "linear"), sides, 0.03)
+        got = resample(transformed_samples(texels, identity(2), sides, "linear"), sides, 0.03)
         assert got.values.shape == (2, sides[0] ** 2, sides[1] ** 2, 3)
         if sides == (1, 1):
             # One sample of weight 1 against precisions of 3e-5, twice.
@@ -504,7 +520,7 @@ class TestDegenerate:
         """Duplicates are a mean, however many."""
         lights = np.tile(directions_at(0.8), (1, 50, 1))
         texels = texel_samples(rng, 1, 1, 50, lights=lights)
-        samples = rooted_samples(texels, identity(1), (1, 5), "linear")
+        samples = transformed_samples(texels, identity(1), (1, 5), "linear")
         at = interpolated(samples, resample(samples, (1, 5), 0.03).values)[0, 0, 0]
         mean = samples.values[0, 0].mean(axis=0)
         assert np.allclose(at, mean, rtol=1e-3)  # the prior's weight against 50 samples

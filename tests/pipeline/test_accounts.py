@@ -41,8 +41,12 @@ def test_all_accounts_add_up(finished_job):
 def test_samples_fitted_are_those_with_weight_in_the_fit(finished_job):
     field = open_field(finished_job.stages.root / "compression" / "field.rfld")
     reader = finished_job.base_reader.rotated(field.local_from_world)
-    rooted = reader.rooted(finished_job.seen_texels)
-    weights = rooted.view_weights[:, :, None] * rooted.light_weights[:, None] * rooted.pairs
+    transformed = reader.transformed(finished_job.seen_texels)
+    weights = (
+        transformed.view_weights[:, :, None]
+        * transformed.light_weights[:, None]
+        * transformed.pairs
+    )
     account = next(
         a
         for a in accounts_of(finished_job)
