@@ -66,10 +66,10 @@ points = {points}
 # Works of the stages that go texel by texel: all texels that are seen, but for those that
 # shape the basis in the first. Of the other works the number of texels is no matter.
 SHAPING, COMPLETING = "resampling for the basis", "completing all texels"
-REFINING = "frames on the samples"
+ALIGNING = "frames of all texels"
 BY_TEXELS = {
     "completion": (COMPLETING,),
-    "alignment": (REFINING,),
+    "alignment": (ALIGNING,),
     "resampling": (COMPLETING,),
     "compression": (
         "frames against the model",

@@ -87,9 +87,9 @@ class AlignmentOptions:
     iterations : int
         Rounds of expectation maximisation.
     n_clusters : int
-        Materials told apart by the orientation-invariant distance. On sparse captures one
-        target for all serves better: with 30 x 30 photographs of the demo, 1, 2 and 4
-        clusters give 26.3, 24.9 and 24.3 dB on held-out frames (23.3 without alignment).
+        Materials told apart, on the raw samples; by the orientation-invariant distance of the
+        completed ones alone where `refine` is False, which on sparse captures costs more than
+        one target for all.
     refine : bool
         Refine the frames on the raw samples after the harmonic search on completed ones.
     spread_deg : float

@@ -164,3 +164,21 @@ def test_raw_samples_of_other_texels_are_refused(sparse):
     gridded, raw, _ = sparse
     with pytest.raises(ShapeError, match="raw: expected"):
         refined(gridded, raw.part(np.arange(N - 1)))
+
+
+def test_materials_are_told_apart_on_the_raw_samples(scene):
+    rng = np.random.default_rng(7)
+    truth, label = scene.relief_frames(20, 12), np.arange(N) % 2
+    d, views, lights = scene.dome_directions(), directions(rng, 16), directions(rng, 16)
+    samples = np.zeros((N, 16, 16), np.float32)
+    completed = scene.sample_texels(truth, d, d)
+    for i, k in enumerate(label):
+        material = {"nu": (8.0, 12.0)[k], "diffuse": (0.1, 0.3)[k]}
+        texel = (truth[i : i + 1], views[i], lights[i])
+        samples[i] = scene.sample_texels(*texel, **material)[0]
+    # The completed samples are all of one material: whatever is told apart, the raw ones tell.
+    raw = SampleSet(samples, views, lights)
+    result = align(completed, d, d, 6, n_clusters=2, raw=Source(raw), refine=OPTIONS)
+    agreement = np.mean(result.cluster == label)
+    # Labels may be swapped; one texel in twenty shows too little of its highlight.
+    assert max(agreement, 1 - agreement) > 0.95

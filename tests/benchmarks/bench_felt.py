@@ -1,4 +1,4 @@
-"""A measured felt turned by known rotations: error of the recovered frames, by margin.
+"""A measured felt rotated by known rotations: error of the recovered frames, by margin.
 
     python tests/benchmarks/bench_felt.py --texels 1000 --tilt 60 --noise 0.02
 

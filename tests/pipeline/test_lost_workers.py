@@ -22,7 +22,7 @@ HERE = Path(__file__).resolve().parent
 WORKS = (
     "observations/projecting photographs",
     "completion/completing all texels",
-    "alignment/frames on the samples",
+    "alignment/frames of all texels",
     "resampling/completing all texels",
     "compression/coefficients on the samples, part 1",
 )
