@@ -47,7 +47,7 @@ def fingerprint(value: Any) -> str:
 
 @cache
 def _source() -> bytes:
-    """Digest of the source of this package: other code may draw other pictures."""
+    """Digest of the source of this package: other code may draw other images."""
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(file.read_bytes())

@@ -74,7 +74,7 @@ def _unseen_camera(
 def _unseen_light(
     lights: Sequence[Table], centre: Array, viewer: Array, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Light on the viewer's side if there is one: pictures of the dark side say little."""
+    """Light on the viewer's side if there is one: the dark side carries little information."""
     positions = np.stack([_light_position(light, centre) for light in lights])
     intensities = np.stack([_light_intensity(light) for light in lights])
     frontal = np.flatnonzero((positions - centre) @ (viewer - centre) > 0.0)

@@ -2,7 +2,7 @@
 
 Repairs are stated: each leaves a line that `capture-sim` prints and the capture keeps.
 
-* triangles without area and triangles that occur twice are dropped;
+* triangles without area and triangles that occur twice are removed;
 * triangles that are turned against their neighbours are turned back, and closed parts
   whose triangles all face inwards are turned inside out;
 * small holes, whose rim spans at most a fifth of the object, are closed by fans; wider
@@ -210,7 +210,7 @@ def _rims(place: NDArray[np.intp], edges: NDArray[np.int32]) -> list[NDArray[np.
 
 
 def _closed(triangles: Triangles, rim: NDArray[np.int32]) -> Triangles:
-    """Close a hole by a fan about the middle of its rim."""
+    """Close a hole by a fan about the centroid of its rim."""
     middle = len(triangles.vertices)
     centre = triangles.vertices[rim[:, 0]].mean(axis=0, keepdims=True)
     fan = np.stack([rim[:, 1], rim[:, 0], np.full(len(rim), middle)], axis=1)

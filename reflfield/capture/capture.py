@@ -336,7 +336,7 @@ class Capture:
         Parameters
         ----------
         views, lights : (n,) array_like of int, optional
-            Indices to keep; None keeps all. Photographs of others are dropped.
+            Indices to keep; None keeps all. Photographs of others are removed.
         """
         keep_views = _indices("views", views, self.n_views)
         keep_lights = _indices("lights", lights, self.n_lights)

@@ -152,7 +152,7 @@ def check_environments(capture: Capture) -> None:
 
 
 def _check_files_once(capture: Capture) -> None:
-    """Demand that no picture stands for two photographs, as of a list with a slip does."""
+    """Demand that no file is listed for two photographs."""
     seen: dict[tuple[Path, str | None], str] = {}
     for photograph in capture.photographs:
         pair = (capture.cameras[photograph.camera].id, capture.lights[photograph.light].id)

@@ -13,7 +13,7 @@ from reflfield.errors import InputError
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
-# Bracketed exposures: a stored value this close to 0 or 1 says nothing about radiance.
+# Bracketed exposures: a stored value this close to 0 or 1 is no measurement of radiance.
 BRACKET_MARGIN = 0.02
 
 

@@ -1,7 +1,7 @@
 """Which layer of an image file is the photograph.
 
-Renderers write what they compute beside the picture: normals, depth, albedo, single light
-paths. The picture is, in this order:
+Renderers write what they compute beside the image: normals, depth, albedo, single light
+paths. The image is, in this order:
 
 1. the layer that is asked for by name;
 2. the only layer there is, if it has colour or luminance;
@@ -23,18 +23,18 @@ from reflfield.capture.exr_headers import ExrPart
 from reflfield.capture.image_headers import ImageHeader
 from reflfield.errors import CaptureError
 
-# Names that renderers and compositors give the picture itself.
+# Names that renderers and compositors give the image itself.
 COMBINED = frozenset(
     ("combined", "beauty", "rgba", "rgb", "c", "ci", "color", "colour", "composite", "final")
 )
-# What grey pictures call their one channel. Depth (Z) and the like are none.
+# What grey images call their one channel. Depth (Z) and the like are none.
 LUMINANCE = frozenset(("y", "l", "v", "i", "r", "gray", "grey", "luminance"))
 MOST_LISTED = 20
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A picture within a file.
+    """An image within a file.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def choose_layer(path: Path, header: ImageHeader, wanted: str | None = None) -> 
     Raises
     ------
     CaptureError
-        If none has that name, several have, or none is the picture without doubt. The
+        If none has that name, several have, or none is unambiguously the image. The
         message lists what is there.
     """
     if header.kind == "exr":
@@ -172,11 +172,11 @@ def _doubt(
     if not names:
         listed = ", ".join(channels[:MOST_LISTED])
         return CaptureError(
-            f"{path}: expected channels R, G, B (or Y), received {listed}; export the picture "
+            f"{path}: expected channels R, G, B (or Y), received {listed}; export the image "
             "itself"
         )
     what = "pages" if header.kind == "tiff" else "layers or parts"
-    expected = f"the layer {wanted!r}" if wanted else "one that is the picture without doubt"
+    expected = f"the layer {wanted!r}" if wanted else "one that is unambiguously the image"
     return CaptureError(
         f"{path}: expected {expected}, received the {what} {shown}; say which one with "
         '`layer="NAME"` or "layer" in capture.json'

@@ -120,7 +120,7 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
     near = [light.position for light in capture.lights if light.kind in (POINT, SPOT)]
     far = [light.direction for light in capture.lights if light.kind == DIRECTIONAL]
     views = np.concatenate([c.view_directions(centre[None]) for c in capture.cameras])
-    # A flat sample is seen and lit from the camera's side, whatever is up in the picture.
+    # A flat sample is seen and lit from the camera's side, whatever is up in the image.
     pole = -capture.cameras[0].forward if capture.base_geometry == PLANE else capture.up
     lights = [(p - centre) / max(float(np.linalg.norm(p - centre)), 1e-12) for p in near] + far
     return CaptureSummary(

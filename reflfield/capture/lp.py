@@ -106,7 +106,7 @@ def _behind(directions: list[list[float]], description: Path) -> tuple[str, ...]
     if behind > MOST_BEHIND * len(directions):
         raise CaptureError(
             f"{description}: expected light directions (x right, y up, z towards the camera) "
-            f"in front of the picture, z > 0, received {behind} of {len(directions)} others; "
+            f"in front of the image, z > 0, received {behind} of {len(directions)} others; "
             "do they have another axis towards the camera, or are they angles?"
         )
     if not behind:

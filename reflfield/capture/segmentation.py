@@ -200,7 +200,7 @@ def _grabcut(encoded: Float32, border: Bool) -> Bool:
 
 
 def _cleaned(inside: Bool) -> Bool:
-    """Gaps closed, crumbs dropped, small holes filled; large holes keep their shape."""
+    """Close gaps, remove small components, fill small holes; large holes keep their shape."""
     longer = max(inside.shape)
     joined = _closed(inside, max(1, round(CRACK * longer / 2)))
     parts = _large_parts(joined, SMALLEST_PART)

@@ -225,7 +225,7 @@ def _directory(
 def _values(
     file: IO[bytes], order: str, kind: str, length: int, value: bytes, big: bool
 ) -> tuple[float, ...]:
-    """Values of a tag: within it if they have room there, else where it points to."""
+    """Values of a tag: within it if they fit there, else where it points to."""
     n_bytes = length * sum(_PLACE[letter] for letter in kind)
     if n_bytes > len(value):
         (position,) = struct.unpack(order + ("Q" if big else "I"), value)

@@ -227,7 +227,7 @@ def _from_angle(frame: Frame, level: Mapping[str, Any], name: str, side: int) ->
 
 
 def _principal_point(frame: Frame, width: int, height: int) -> tuple[float, float]:
-    """Principal point in pixels; the middle of the image where it is not stated."""
+    """Principal point in pixels; the centre of the image where it is not stated."""
     point = []
     for axis, (name, side) in enumerate((("cx", width), ("cy", height))):
         value = None

@@ -100,15 +100,15 @@ class Verdict:
     agree : bool
         True if the views agree that are no outliers.
     uncovered : (n_views,) float64
-        Share of each silhouette that the others leave no room for, all views considered.
-    spoilt : (n_views,) float64
-        Mean share of the other silhouettes for which a view alone leaves no room.
+        Share of each silhouette that the others exclude, all views considered.
+    excluded : (n_views,) float64
+        Mean share of the other silhouettes that a view alone excludes.
     """
 
     outliers: tuple[int, ...]
     agree: bool
     uncovered: Array
-    spoilt: Array
+    excluded: Array
 
 
 def judge(views: Sequence[View], low: Array, high: Array) -> Verdict:
@@ -145,8 +145,8 @@ def judge(views: Sequence[View], low: Array, high: Array) -> Verdict:
             outliers.remove(view)
             kept = some
     others = max(len(views) - 1, 1)
-    spoilt = (first.blame.sum(axis=1) - np.diag(first.blame)) / others
-    return Verdict(tuple(sorted(outliers)), agree, first.uncovered, spoilt)
+    excluded = (first.blame.sum(axis=1) - np.diag(first.blame)) / others
+    return Verdict(tuple(sorted(outliers)), agree, first.uncovered, excluded)
 
 
 def votes_of(views: Sequence[View], low: Array, high: Array) -> Votes:

@@ -26,16 +26,16 @@ class Contradiction:
     ----------
     view : str
         Name of the camera.
-    spoilt : float
-        Mean share of the other silhouettes for which this view alone leaves no room.
+    excluded : float
+        Mean share of the other silhouettes that this view alone excludes.
     uncovered : float
-        Share of its silhouette for which the others leave no room.
+        Share of its silhouette that the others exclude.
     explanation : Explanation, optional
         The mistake that explains it, if one was found.
     """
 
     view: str
-    spoilt: float
+    excluded: float
     uncovered: float
     explanation: Explanation | None
 
@@ -45,13 +45,13 @@ class Contradiction:
         Examples
         --------
         >>> Contradiction("v005", 0.42, 0.71, None).words(13)
-        'v005: its silhouette contradicts the 13 others (it leaves no room for 42 % of what \
-they show, they leave none for 71 % of it); check its camera and its silhouette'
+        'v005: its silhouette contradicts the 13 others (it excludes 42 % of their area, they \
+exclude 71 % of its own); check its camera and its silhouette'
         """
         text = (
             f"{printable(self.view)}: its silhouette contradicts the {n_others} others (it "
-            f"leaves no room for {100 * self.spoilt:.0f} % of what they show, they leave none "
-            f"for {100 * self.uncovered:.0f} % of it)"
+            f"excludes {100 * self.excluded:.0f} % of their area, they exclude "
+            f"{100 * self.uncovered:.0f} % of its own)"
         )
         why = self.explanation
         if why is None:
@@ -79,7 +79,7 @@ class Disagreement:
 
     @classmethod
     def of(cls, views: Sequence[View], bounds: Bounds | None = None) -> Disagreement:
-        """What views say about each other, in a box if it is known."""
+        """Compare the silhouettes of views with each other, in a box if it is known."""
         return cls(examine(views, bounds), tuple(view.camera.id for view in views))
 
     @property
@@ -94,7 +94,7 @@ class Disagreement:
 
     @property
     def covered(self) -> float:
-        """Median share of the silhouettes that the others leave room for."""
+        """Median share of the silhouettes that the others do not exclude."""
         return 0.0 if self.verdict is None else 1.0 - float(np.median(self.verdict.uncovered))
 
     def words(self) -> str:
@@ -106,6 +106,6 @@ class Disagreement:
         worst = worst[np.argsort(-uncovered[worst], kind="stable")]
         shown = [f"{self.names[i]} {100 * uncovered[i]:.0f} %" for i in worst]
         return (
-            f"{len(worst)} of {len(uncovered)} silhouettes show parts for which the others "
-            f"leave no room ({listed(shown)} of their areas), and no few views are to blame"
+            f"{len(worst)} of {len(uncovered)} silhouettes show parts that the others "
+            f"exclude ({listed(shown)} of their areas), and no small group of views explains it"
         )

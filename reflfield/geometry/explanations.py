@@ -29,7 +29,7 @@ from reflfield.geometry.ray_scene import RayScene
 Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Pixels along the longer side of the pictures in which hull and silhouettes are compared.
+# Pixels along the longer side of the images in which hull and silhouettes are compared.
 OVERLAP_PIXELS = 256
 
 # A mistake explains a contradiction if, undone, silhouette and hull overlap so well (the
@@ -168,7 +168,7 @@ def _mask_mistakes(shown: Bool, expected: Bool) -> Iterator[tuple[str, str, floa
 
 
 def _shift(shown: Bool, expected: Bool) -> tuple[int, int]:
-    """Rows and columns by which one picture is to be moved to lie on another."""
+    """Rows and columns by which one image is to be moved to lie on another."""
     height, width = (2 * n for n in shown.shape)
     spectrum = np.fft.rfft2(expected, (height, width)) * np.conj(
         np.fft.rfft2(shown, (height, width))
@@ -188,7 +188,7 @@ def _centre(picture: Bool) -> Array:
 
 
 def _moved(picture: Bool, scale: float, down: float, right: float) -> Bool:
-    """Picture scaled about its first pixel, then moved."""
+    """Image scaled about its first pixel, then moved."""
     matrix = np.array([[scale, 0.0, right], [0.0, scale, down]])
     height, width = picture.shape
     return np.asarray(
@@ -279,7 +279,7 @@ def _agreement(
     silhouettes: Sequence[NDArray[np.floating]],
     scratch: Path | None,
 ) -> float:
-    """Median share of the silhouettes that the others leave room for; 0 without a hull.
+    """Median share of the silhouettes that the others are consistent with; 0 without a hull.
 
     Views that the object leaves exclude little and agree with anything: with most of them
     nothing is explained.

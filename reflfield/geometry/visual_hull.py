@@ -86,7 +86,7 @@ class HullOptions:
     n_triangles : int
         Triangles after decimation; 0 keeps all.
     minimum_component : float
-        Parts with a smaller share of the largest part's area are dropped.
+        Parts with a smaller share of the largest part's area are removed.
     bounds : pair of (3,) float, optional
         Lowest and highest corner of a box, metres, to use instead of the one found from
         the silhouettes: needed where the object leaves the frame in too many views.
@@ -320,7 +320,7 @@ def _outcome_with_outliers(
     contradictions = tuple(_contradictions(views, silhouettes, disagreement, others))
     words = [contradiction.words(len(kept)) for contradiction in contradictions]
     harmless = len(kept) < LEAST_WITNESSES and all(
-        one.spoilt < CONTRADICTION and one.explanation is None for one in contradictions
+        one.excluded < CONTRADICTION and one.explanation is None for one in contradictions
     )
     if options.tolerance == AUTO and usable is not None and harmless:
         # A silhouette that is too large removes nothing of the object, and where no mistake
@@ -360,7 +360,7 @@ def _contradictions(
             why = explain_view(camera, silhouettes[i], others.mesh, swapped)
         verdict = disagreement.verdict
         yield Contradiction(
-            camera.id, float(verdict.spoilt[i]), float(verdict.uncovered[i]), why
+            camera.id, float(verdict.excluded[i]), float(verdict.uncovered[i]), why
         )
 
 

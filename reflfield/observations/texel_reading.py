@@ -228,7 +228,7 @@ class TexelReader:
     def _seen(self, texels: Indices) -> tuple[Bools, Bools]:
         """Views and lights of which some texels have samples that say something."""
         observed = self.store.observed
-        # Outside a spot's cone the sample says nothing, though no shadow falls there.
+        # Outside a spot's cone the sample is no measurement, though no shadow falls there.
         lit = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
         return observed.views[texels], observed.lights[texels] & lit
 

@@ -245,7 +245,7 @@ def replacing(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
-# What NumPy says of a disk that has no room, with no number of the system.
+# What NumPy says of a disk that is full, with no number of the system.
 _NUMPY_CUT_OFF = re.compile(r"[0-9]+ requested and [0-9]+ written")
 
 

@@ -64,7 +64,7 @@ class ProgressLines:
     write : callable
         Takes a line.
     interval : float
-        Seconds between lines; shorter work says nothing.
+        Seconds between lines; shorter work is not reported.
     clock : callable
         Seconds, monotonic.
 

@@ -187,7 +187,7 @@ def test_masks_of_many_objects_are_said_to_disagree(rig, rng):
         said = str(error)
     else:
         said = " ".join(report.warnings)
-    assert "silhouettes show parts for which the others leave no room" in said
+    assert "silhouettes show parts that the others exclude" in said
 
 
 # ---------------------------------------------------------------- honest variation
