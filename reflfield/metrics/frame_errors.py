@@ -68,13 +68,13 @@ def surface_points(
 
 
 @dataclass(frozen=True)
-class FreeTurn:
-    r"""Turn about the normal that the reflectance leaves open, taken out of the tangents.
+class UndeterminedRotation:
+    r"""Rotation about the normal that the reflectance does not determine.
 
-    A target's own tangent is a choice: turned together with all of its frames it explains
-    the samples as well. So for every target, and every material that it serves, the turn
+    The tangent of a target is arbitrary: rotated together with all of its frames it fits the
+    samples equally well. For every target, and every material aligned to it, the rotation
     :math:`\frac12 \arg \sum_i e^{2 i \varphi_i}` is removed, :math:`\varphi_i` being the angle
-    from the true to the recovered tangent; doubled, as half a turn changes nothing.
+    from the true to the recovered tangent; doubled, because tangents are compared as lines.
 
     Attributes
     ----------
@@ -100,12 +100,12 @@ class FrameErrors:
     texel : (n_matched,) int64
         Texels that have a true frame near them.
     normal, tangent : (n_matched,) float64
-        Angle between normals, and between the *lines* of the tangents: turning
+        Angle between normals, and between the *lines* of the tangents: rotating
         a tangent by 180 degrees does not change an anisotropic reflectance.
-        One turn about the normal is free for each target and material, and removed.
+        One rotation about the normal is undetermined for each target and material, and removed.
     label : (n_matched,) int64
         Material of the matched surface point.
-    turns : tuple of FreeTurn
+    rotations : tuple of UndeterminedRotation
         What was removed; empty if no targets were named.
     """
 
@@ -113,14 +113,14 @@ class FrameErrors:
     normal: Array
     tangent: Array
     label: NDArray[np.int64]
-    turns: tuple[FreeTurn, ...] = ()
+    rotations: tuple[UndeterminedRotation, ...] = ()
 
     def of_material(self, label: int) -> FrameErrors:
         """Errors of the texels of one material."""
         mine = self.label == label
-        turns = tuple(turn for turn in self.turns if turn.label == label)
+        rotations = tuple(rotation for rotation in self.rotations if rotation.label == label)
         return FrameErrors(
-            self.texel[mine], self.normal[mine], self.tangent[mine], self.label[mine], turns
+            self.texel[mine], self.normal[mine], self.tangent[mine], self.label[mine], rotations
         )
 
     def summary(self) -> dict[str, float]:
@@ -157,8 +157,8 @@ def frame_errors(
         Texels farther than this from any true point are left out, metres: where
         the hull bridges a hollow, no texel shows one point of the surface.
     targets : (n_texels,) array_like of int, optional
-        Target that each texel was aligned to: one turn about the normal is removed for
-        each of them and each material, see `FreeTurn`. None removes nothing.
+        Target that each texel was aligned to: one rotation about the normal is removed for
+        each of them and each material, see `UndeterminedRotation`. None removes nothing.
 
     Returns
     -------
@@ -198,12 +198,12 @@ def frame_errors(
         true.append(_interpolated_frames(tree, surface, texels[block]))
     normal, tangent = (np.concatenate(part) for part in zip(*true, strict=True))
     label = surface.label[nearest[matched]]
-    turns: tuple[FreeTurn, ...] = ()
+    rotations: tuple[UndeterminedRotation, ...] = ()
     own_tangent = own_frames[:, 0]
     if targets is not None:
         target = np.asarray(targets)
         check_shape("targets", target, (len(texels),))
-        turns, own_tangent = _without_free_turns(
+        rotations, own_tangent = _without_undetermined_rotations(
             own_frames, normal, tangent, target[matched], label
         )
     return FrameErrors(
@@ -211,18 +211,18 @@ def frame_errors(
         angle_deg(own_frames[:, 2], normal),
         _line_angle_deg(own_tangent, tangent),
         label,
-        turns,
+        rotations,
     )
 
 
-def _without_free_turns(
+def _without_undetermined_rotations(
     frames: Array,
     normal: Array,
     tangent: Array,
     target: NDArray[np.integer[Any]],
     label: NDArray[np.int64],
-) -> tuple[tuple[FreeTurn, ...], Array]:
-    """Turns that are free, and the tangents (n, 3) without them."""
+) -> tuple[tuple[UndeterminedRotation, ...], Array]:
+    """Undetermined rotations, and the tangents (n, 3) without them."""
     # The doubled angle in the plane of the true normal.
     across = np.cross(normal, tangent)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
@@ -230,14 +230,16 @@ def _without_free_turns(
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
     along, aside = (np.einsum("nd,nd->n", frames[:, 0], axis) for axis in (tangent, across))
     doubled = np.exp(2j * np.arctan2(aside, along))
-    turns, angle = [], np.zeros(len(frames))
+    rotations, angle = [], np.zeros(len(frames))
     for key in np.unique(np.stack([target, label], axis=1), axis=0):
         mine = (target == key[0]) & (label == key[1])
         angle[mine] = 0.5 * np.angle(doubled[mine].sum())
         degrees = float(np.degrees(angle[mine][0]))
-        turns.append(FreeTurn(int(key[0]), int(key[1]), degrees, int(mine.sum())))
+        rotations.append(
+            UndeterminedRotation(int(key[0]), int(key[1]), degrees, int(mine.sum()))
+        )
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return tuple(turns), c * frames[:, 0] - s * frames[:, 1]
+    return tuple(rotations), c * frames[:, 0] - s * frames[:, 1]
 
 
 def angle_deg(a: ArrayLike, b: ArrayLike) -> Array:
@@ -289,7 +291,7 @@ def _interpolated_frames(
     )
     reach = np.maximum(distance[:, -1:], 1e-300)
     weight = alike * np.exp(-2.0 * (distance / reach) ** 2)
-    # Tangents are lines: turn all to the side of the nearest.
+    # Tangents are lines: flip all to the side of the nearest.
     side = np.where(np.einsum("nkd,nd->nk", tangent, tangent[:, 0]) < 0.0, -1.0, 1.0)
     vectors = np.concatenate([normal, side[..., None] * tangent], axis=2)
     fitted = _value_at_origin(offset / reach[..., None], vectors, weight)

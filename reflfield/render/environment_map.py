@@ -2,9 +2,9 @@
 
 A map is a latitude-longitude image, twice as wide as high, row 0 at the zenith; see
 `reflfield.render.map_directions` for the directions of its pixels and for the way a
-map is turned into a world. A map whose frame in the world is stated
+map is rotated into a world. A map whose frame in the world is stated
 (`world_from_environment`, as captures state it) is used as it is; else its up axis is
-turned to that of the field it lights.
+rotated to that of the field it lights.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class EnvironmentMap:
     radiance : (height, width, 3) float32
         Linear radiance, W sr^-1 m^-2; negative values count as 0.
     convention : {"openexr", "mitsuba", "blender"}
-        How pixels turn into directions; see `map_directions`.
+        How pixels become directions; see `map_directions`.
     world_from_environment : (3, 3) float, optional
         Rotation from the map's frame to the world. By default it is open: the renderer
         turns the map's up to the field's, and what stands for itself stays in the map's
@@ -153,7 +153,7 @@ class EnvironmentMap:
         up : (3,) array_like
             World direction.
         rotation_deg : float
-            Further turn about it, degrees, counter-clockwise seen from above.
+            Further rotation about it, degrees, counter-clockwise seen from above.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Directions of an environment map's pixels, and how a map is turned into a world.
+"""Directions of an environment map's pixels, and the rotation of a map into a world.
 
 A map is a latitude-longitude image, row 0 at the zenith. Pixels are areas: the
 centre of pixel (row, column) has ``u = (column + 1/2) / width`` and
@@ -20,7 +20,7 @@ The OpenEXR library puts the *centres* of the corner pixels on the poles and the
 seam, Mitsuba 3.9 those of the first and last rows on the poles; maps in
 circulation do not, and neither does this module. The difference is half a pixel.
 
-A map whose frame in the world is not stated is turned by the shortest rotation that brings
+A map whose frame in the world is not stated takes the shortest rotation that brings
 its up axis to the world's (`world_from_map`):
 
 ==========  ============  =======================================
@@ -89,17 +89,17 @@ def direction_from_uv(u: ArrayLike, v: ArrayLike, convention: str) -> Array:
 
 
 def world_from_map(convention: str, up: ArrayLike, rotation_deg: float = 0.0) -> Array:
-    """Rotation that turns a map's zenith to a direction of the world.
+    """Rotation of a map's zenith to a direction of the world.
 
     Parameters
     ----------
     convention : {"openexr", "mitsuba", "blender"}
         Says which axis of the map is up.
     up : (3,) array_like
-        World direction that the map's zenith is turned to, by the shortest rotation; where
-        the two are opposite, by half a turn about X.
+        World direction that the map's zenith is rotated to, by the shortest rotation; where
+        the two are opposite, by 180 degrees about X.
     rotation_deg : float
-        Angle by which the map is then turned about `up`, degrees, counter-clockwise seen
+        Angle by which the map is then rotated about `up`, degrees, counter-clockwise seen
         from above.
 
     Returns

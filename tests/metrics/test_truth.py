@@ -178,8 +178,8 @@ def test_one_turn_is_removed_for_each_target_and_material(rng):
     noise = rng.normal(0, 4.0, n) + 180.0 * rng.integers(0, 2, n)
     found = turned_about_normals(frames, planted[target, label] + noise)
     errors = frame_errors(position, found, points, 1e-9, target)
-    assert {(t.target, t.label) for t in errors.turns} == set(np.ndindex(3, 2))
-    for turn in errors.turns:
+    assert {(t.target, t.label) for t in errors.rotations} == set(np.ndindex(3, 2))
+    for turn in errors.rotations:
         # The mean of about 500 turns of 4 degrees: 0.18; five times that.
         apart = turn.degrees - planted[turn.target, turn.label]
         assert abs((apart + 90) % 180 - 90) < 0.9
@@ -201,7 +201,7 @@ def test_tilt_does_not_bias_the_turn(rng):
     tilted = Rotation.from_rotvec(tilt).as_matrix() @ turned_about_normals(
         frames, np.full(n, 20.0)
     )
-    (turn,) = frame_errors(points.position, tilted, points, 1e-9, np.zeros(n, int)).turns
+    (turn,) = frame_errors(points.position, tilted, points, 1e-9, np.zeros(n, int)).rotations
     # A tilt of 8 degrees moves single tangents by up to half a degree about the normal.
     assert turn.degrees == pytest.approx(20.0, abs=0.05)
 

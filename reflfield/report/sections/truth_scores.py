@@ -158,9 +158,15 @@ def _rotations_table(variants: Mapping[str, FrameErrors]) -> Table:
     return Table(
         ("frames", "target", "material", "rotation removed, °", "texels"),
         tuple(
-            (name, turn.target, turn.label, f"{turn.degrees:.1f}", turn.n_texels)
+            (
+                name,
+                rotation.target,
+                rotation.label,
+                f"{rotation.degrees:.1f}",
+                rotation.n_texels,
+            )
             for name, errors in variants.items()
-            for turn in errors.turns
+            for rotation in errors.rotations
         ),
         "Rotations about the normal removed before tangents are compared: rotating a target "
         "and all its frames together does not change the fit.",
