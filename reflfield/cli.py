@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -14,7 +15,7 @@ import typer
 
 from reflfield import __version__
 from reflfield.errors import InputError, ReflfieldError
-from reflfield.flags import with_flags
+from reflfield.flags import FLAGS, current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
 from reflfield.util.terminal import say, say_error, showing_progress
 
@@ -30,6 +31,7 @@ app = typer.Typer(
 )
 MISSED = 3  # status where the quality that was asked for is not reached
 LONGEST_MESSAGE = 1600
+NOTHING_LEFT = "nothing half-written is left"
 GOES_ON = "the same command goes on where it stopped"
 
 
@@ -68,7 +70,7 @@ LayerOption = Annotated[
 ]
 Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
 MaxMemory = Annotated[str, typer.Option(help="Ceiling of resident memory.")]
-Samples = Annotated[int, typer.Option(help="Rays per pixel, a square number.")]
+RaysPerPixel = Annotated[int, typer.Option(help="A square number.")]
 
 
 def main() -> None:
@@ -78,7 +80,7 @@ def main() -> None:
     notes.propagate = False
     try:
         with ending_on_signals():
-            app()
+            app(args=list(current_flags(sys.argv[1:], say_error)))
     except ReflfieldError as error:
         fail(with_flags(str(error)), error)
     except OSError as error:  # a folder that cannot be written, a full disk
@@ -133,9 +135,9 @@ def demo(
     from reflfield.demo import run_demo
 
     started = time.perf_counter()
-    with showing_progress(GOES_ON):
-        job = run_demo(out, n_workers(workers))
-    say_results(job, started)
+    with working(GOES_ON):
+        result = run_demo(out, n_workers(workers))
+    say_results(result, started)
 
 
 @app.command()
@@ -187,35 +189,37 @@ def run(
 
     Status 0: done. 2: input cannot be used. 3: done, but --psnr is not reached. 130: Ctrl-C.
     """
-    from reflfield.capture.readers import open_capture
-    from reflfield.options import Resources, parse_bytes, parse_hold_out
-    from reflfield.pipeline.stages import run as run_pipeline
+    from reflfield.api.captures import open_capture
+    from reflfield.api.reconstruction import read_options, reconstruct
+    from reflfield.options import parse_hold_out
 
     started = time.perf_counter()
-    options = pipeline_options(config, [*(set_ or []), *size_settings(size, psnr)])
-    resources = Resources(n_workers(workers), parse_bytes(max_memory), scheduler, store)
+    options = read_options(config, [*(set_ or []), *size_settings(size, psnr)])
+    resources = limits(workers, max_memory, scheduler, store)
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own
-        capture, out = capture.resolve(), out.resolve()
-    reading = image_reading(encoding, layer)
-    opened = open_capture(
-        capture, format, follow_links=follow_links, test_split=held.test, reading=reading
+        capture = capture.resolve()
+    photographed = open_capture(
+        *(capture, format),
+        encoding=encoding,
+        layer=layer,
+        follow_links=follow_links,
+        test_split=held.test,
     )
-    with showing_progress(GOES_ON):
-        job = run_pipeline(
-            opened, out, options, hold_out=held, resources=resources, first=from_, last=until
-        )
-    say_results(job, started)
+    asked: dict[str, Any] = {"options": options, "hold_out": held, "resources": resources}
+    with working(GOES_ON):
+        result = reconstruct(photographed, out, **asked, from_stage=from_, until=until)
+    say_results(result, started)
 
 
 @app.command()
 def relight(
     field: Annotated[Path, typer.Argument(help="A field.rfld.")],
     out: Out,
-    frames: Annotated[
-        Path | None, typer.Option(help="Frames with cameras and lights of their own.")
+    capture: Annotated[
+        Path | None, typer.Option(help="Whose cameras and lights the images have.")
     ] = None,
-    orbit: Annotated[int | None, typer.Option(help="Frames of a turntable.")] = None,
+    orbit: Annotated[int | None, typer.Option(help="Images of a turntable.")] = None,
     environment: Annotated[
         Path | None, typer.Option(help="Latitude-longitude map for the turntable.")
     ] = None,
@@ -232,15 +236,16 @@ def relight(
     environment_rotation: Annotated[
         float | None,
         typer.Option(
-            metavar="DEGREES", help="Turn of the map about its zenith, to the left from above."
+            metavar="DEGREES",
+            help="Of the map about its zenith, to the left from above.",
         ),
     ] = None,
     light: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Direction to a distant light.")
     ] = None,
-    samples: Samples = 16,
+    rays_per_pixel: RaysPerPixel = 16,
     size: Annotated[
-        int | None, typer.Option(help="Side of turntable pictures, pixels; 400.")
+        int | None, typer.Option(help="Side of the turntable's images, pixels; 400.")
     ] = None,
     elevation: Annotated[
         float | None, typer.Option(help="Of the turntable's camera, degrees; 20.")
@@ -250,67 +255,58 @@ def relight(
     format: Format = None,
     follow_links: FollowLinks = False,
 ) -> None:
-    """Render frames, or a turntable under an environment map or a distant light."""
-    from reflfield.field.file import open_field
-    from reflfield.pipeline.turntables import TurntableLighting, write_turntable
+    """Render what a capture's photographs would show, or a turntable."""
+    from reflfield.api.captures import open_capture
+    from reflfield.api.fields import open_field
+    from reflfield.api.images import relight as relight_capture
+    from reflfield.api.images import render_turntable
 
-    if (frames is None) == (orbit is None):
-        raise InputError("relight: expected either --frames FRAMES or --orbit N, one of them")
-    of_map = {"--convention": convention, "--environment-up": environment_up,
-              "--environment-rotation": environment_rotation}  # fmt: skip
-    of_orbit = {"--environment": environment, "--light": light, "--size": size,
-                "--elevation": elevation}  # fmt: skip
-    refuse_without("--orbit; frames bring their own cameras and lights", orbit, of_orbit)
+    if (capture is None) == (orbit is None):
+        raise InputError("relight: expected either --capture CAPTURE or --orbit N, one of them")
+    of_map = {"convention": convention, "environment_up": environment_up,
+              "environment_rotation": environment_rotation}  # fmt: skip
+    of_orbit = {"environment": environment, "light": light, "size": size,
+                "elevation_deg": elevation}  # fmt: skip
+    refuse_without("--orbit; a capture brings its own cameras and lights", orbit, of_orbit)
     refuse_without("--environment MAP", environment, of_map)
-    limits = picture_limits(samples, workers, max_memory)
-    opened = open_field(field, max_bytes=limits[1].max_memory)
-    with showing_progress():
-        if frames is not None:
-            reading = {"format": format, "follow_links": follow_links}
-            made = relight_to(opened, frames, out, limits, reading)
+    resources = limits(workers, max_memory)
+    made_with = image_options(rays_per_pixel, resources)
+    opened = open_field(field, max_memory=resources.max_memory)
+    with working():
+        if capture is not None:
+            wanted = open_capture(
+                capture, format, follow_links=follow_links, require_photographs=False
+            )
+            made = relight_capture(opened, wanted, out, **made_with)
         else:
-            turn = (environment_up, environment_rotation)
-            lighting = TurntableLighting(environment, light, convention, *turn)
-            chosen = {"n_frames": orbit, "size": size, "elevation_deg": elevation}
-            made = write_turntable(opened, lighting, out, limits[0], limits[1], chosen)
+            asked: dict[str, Any] = of_orbit | of_map | {"n_frames": orbit}
+            stated = {name: value for name, value in asked.items() if value is not None}
+            made = render_turntable(opened, out, **stated, **made_with)
     for path in made:
         say(str(path))
 
 
-def picture_limits(samples: int, workers: int, max_memory: str) -> Any:
-    """Options of pictures, and what they may use."""
-    from reflfield.options import Resources, parse_bytes
+def image_options(rays_per_pixel: int, resources: Any) -> dict[str, Any]:
+    """How images are rendered, and with what."""
     from reflfield.render.renderer import RenderOptions
 
-    resources = Resources(n_workers(workers), parse_bytes(max_memory))
-    return RenderOptions(samples_per_pixel=samples, workers=resources.workers), resources
+    options = RenderOptions(samples_per_pixel=rays_per_pixel, workers=resources.workers)
+    return {"options": options, "resources": resources}
 
 
 def refuse_without(needed: str, value: Any, options: dict[str, Any]) -> None:
     """Refuse options that say nothing without another one."""
-    stated = [name for name, option in options.items() if option is not None]
+    stated = [FLAGS[name] for name, option in options.items() if option is not None]
     if value is None and stated:
         raise InputError(f"{', '.join(stated)}: expected with {needed}")
-
-
-def relight_to(
-    field: Any, frames: Path, out: Path, limits: Any, reading: dict[str, Any]
-) -> list[Path]:
-    """Relight frames; their EXR files."""
-    from reflfield.capture.readers import open_capture
-    from reflfield.pipeline.memory import check_frames_memory
-    from reflfield.pipeline.relight_command import write_relit_frames
-
-    opened = open_capture(frames, require_photographs=False, **reading)
-    return write_relit_frames(field, opened, out, check_frames_memory(field, opened, *limits))
 
 
 @app.command()
 def compare(
     field: Annotated[Path, typer.Argument(help="A field.rfld.")],
-    frames: Annotated[Path, typer.Argument(help="Frames with photographs.")],
+    capture: Annotated[Path, typer.Argument(help="Photographs to compare with.")],
     out: Out,
-    samples: Samples = 16,
+    rays_per_pixel: RaysPerPixel = 16,
     workers: Workers = 0,
     max_memory: MaxMemory = "4GB",
     format: Format = None,
@@ -318,20 +314,20 @@ def compare(
     encoding: EncodingOption = None,
     layer: LayerOption = None,
 ) -> None:
-    """Relight frames and measure them against their photographs."""
-    from reflfield.capture.readers import open_capture
-    from reflfield.field.file import open_field
-    from reflfield.pipeline.compare_command import write_standalone_comparison
-    from reflfield.pipeline.memory import check_frames_memory
+    """Render what the photographs of a capture show, and measure the difference."""
+    from reflfield.api.captures import open_capture
+    from reflfield.api.fields import open_field
+    from reflfield.api.images import compare as compare_with
 
-    limits = picture_limits(samples, workers, max_memory)
-    opened = open_field(field, max_bytes=limits[1].max_memory)
-    reading = image_reading(encoding, layer)
-    with showing_progress():
-        photographed = open_capture(frames, format, follow_links=follow_links, reading=reading)
-        options = check_frames_memory(opened, photographed, *limits, compared=True)
-        comparison = write_standalone_comparison(opened, photographed, out, options)
-    say_metrics(comparison.to_dict())
+    resources = limits(workers, max_memory)
+    made_with = image_options(rays_per_pixel, resources)
+    opened = open_field(field, max_memory=resources.max_memory)
+    with working():
+        photographed = open_capture(
+            capture, format, encoding=encoding, layer=layer, follow_links=follow_links
+        )
+        metrics = compare_with(opened, photographed, out, **made_with)
+    say_metrics(metrics)
     say(f"metrics   {out / 'metrics.json'}")
     say(f"report    {out / 'report' / 'index.html'}")
 
@@ -350,17 +346,16 @@ def inspect(
 
     most_bytes = parse_bytes(max_memory)
     if path.suffix.lower() == ".rfld":
-        from reflfield.field.description import describe as describe_field
-        from reflfield.field.file import open_field
+        from reflfield.api.fields import open_field
 
-        lines = describe_field(open_field(path, max_bytes=most_bytes)).lines()
+        lines = open_field(path, max_memory=most_bytes).describe()
     else:
-        from reflfield.capture.inspect import describe
-        from reflfield.capture.readers import open_capture
+        from reflfield.api.captures import describe_capture, open_capture
 
-        reading = image_reading(encoding, layer)
-        capture = open_capture(path, format, follow_links=follow_links, reading=reading)
-        lines = describe(capture).lines()
+        opened = open_capture(
+            path, format, encoding=encoding, layer=layer, follow_links=follow_links
+        )
+        lines = describe_capture(opened)
     for line in lines:
         say(line)
 
@@ -368,13 +363,23 @@ def inspect(
 # --- helpers ------------------------------------------------------------------------------
 
 
-def image_reading(encoding: str | None, layer: str | None) -> Any:
-    """How the photographs are read, as far as options say it."""
-    from reflfield.capture.encoding import parse_encoding
-    from reflfield.capture.image_files import ImageReading
+@contextmanager
+def working(if_interrupted: str = NOTHING_LEFT) -> Iterator[None]:
+    """Show progress, and leave work in order on Ctrl-C; libraries are imported before."""
+    from reflfield.geometry.open3d_library import load_open3d
 
-    curve = parse_encoding(encoding) if encoding is not None else None
-    return ImageReading(encoding=curve, layer=layer)
+    load_open3d()
+    with showing_progress(if_interrupted):
+        yield
+
+
+def limits(
+    workers: int, max_memory: str, scheduler: str | None = None, store: str | None = None
+) -> Any:
+    """What a command may use."""
+    from reflfield.options import Resources, parse_bytes
+
+    return Resources(n_workers(workers), parse_bytes(max_memory), scheduler, store)
 
 
 def n_workers(wanted: int) -> int:
@@ -386,15 +391,6 @@ def n_workers(wanted: int) -> int:
             f"--workers: expected 1 to {MOST_WORKERS}, or 0 for one per core, received {wanted}"
         )
     return wanted or available_cores()
-
-
-def pipeline_options(config: Path | None, settings: list[str]) -> Any:
-    """Options from a file, overridden by single settings."""
-    from reflfield.options import merged, parse_settings, read_toml, with_tables
-    from reflfield.pipeline.pipeline_options import PipelineOptions
-
-    tables = read_toml(config) if config is not None else {}
-    return with_tables(PipelineOptions(), merged(tables, parse_settings(settings)))
 
 
 def size_settings(size: str, psnr: float | None) -> list[str]:
@@ -413,31 +409,20 @@ def size_settings(size: str, psnr: float | None) -> list[str]:
     return settings
 
 
-def say_results(job: Any, started: float) -> None:
+def say_results(result: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
-    from reflfield.pipeline.hold_out import held_out_words, left_out_words
-    from reflfield.pipeline.model_selection import words_of
-    from reflfield.pipeline.publishing import published
-    from reflfield.pipeline.quantisation_search import missed_quality
-    from reflfield.pipeline.report import problems_of
-
-    for record in job.stages.records:
+    for record in result.stages:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
         say(f"{record.name:<18}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
-    say(f"held out: {held_out_words(job.split)}")
-    for words in (
-        *left_out_words(job.capture, job.split),
-        *words_of(job),
-        *problems_of(job),
-    ):
-        say(words)
-    if job.stages.record("comparison") is not None:
-        say_metrics(json.loads((job.out / "metrics.json").read_text()))
+    for note in result.notes:
+        say(note)
+    if result.metrics:
+        say_metrics(result.metrics)
     say(f"total             {time.perf_counter() - started:8.1f} s")
-    for path in published(job):
+    for path in result.files:
         say(str(path))
-    if missed := missed_quality(job):
-        say_error(f"reflfield: {missed}")
+    if result.missed_quality:
+        say_error(f"reflfield: {result.missed_quality}")
         raise typer.Exit(MISSED)
 
 

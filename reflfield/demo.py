@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from reflfield.capture.readers import open_capture
+from reflfield.api.reconstruction import Result, reconstruct
 from reflfield.errors import ReflfieldError
 from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.sample_fit import SampleFitOptions
 from reflfield.options import HoldOut, Resources
-from reflfield.pipeline.context import Job
 from reflfield.pipeline.pipeline_options import (
     AlignmentOptions,
     ComparisonOptions,
@@ -22,7 +21,6 @@ from reflfield.pipeline.pipeline_options import (
     PipelineOptions,
     TextureOptions,
 )
-from reflfield.pipeline.stages import run
 from reflfield.util.child_processes import tied
 from reflfield.util.progress import report
 
@@ -75,7 +73,7 @@ with ThreadPoolExecutor(1) as pool:
 """
 
 
-def run_demo(out: Path, workers: int) -> Job:
+def run_demo(out: Path, workers: int) -> Result:
     """Simulate the shipped scene into `out`/capture and process it into `out`.
 
     Parameters
@@ -86,7 +84,7 @@ def run_demo(out: Path, workers: int) -> Job:
 
     Returns
     -------
-    Job
+    Result
 
     Raises
     ------
@@ -97,11 +95,11 @@ def run_demo(out: Path, workers: int) -> Job:
         capture = out / "capture"
         if not (capture / "capture.json").is_file():
             simulate(capture, workers)
-        return run(
-            open_capture(capture),
+        return reconstruct(
+            capture,
             out,
-            OPTIONS,
             hold_out=HELD_OUT,
+            options=OPTIONS,
             resources=Resources(workers=workers),
         )
 

@@ -7,6 +7,7 @@ backticks (``raise `max_memory```); nothing else is touched, file names and valu
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable, Iterator
 
 # Argument of the library -> flag of the commands.
 FLAGS = {
@@ -20,6 +21,7 @@ FLAGS = {
     "store": "--store",
     "format": "--format",
     "follow_links": "--follow-links",
+    "test_split": "--hold-out test",
     "encoding": "--encoding",
     "layer": "--layer",
     "size": "--size",
@@ -31,8 +33,10 @@ FLAGS = {
     "environment_up": "--environment-up",
     "environment_rotation": "--environment-rotation",
     "light": "--light",
-    "samples_per_pixel": "--samples",
+    "samples_per_pixel": "--rays-per-pixel",
 }
+# Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
+RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}
 _QUOTED = re.compile(r"`(\w+)(?:=([^`]*))?`")
 _HOLD_OUT = re.compile(r"HoldOut\((.*)\)")
 
@@ -56,6 +60,26 @@ def with_flags(message: str) -> str:
     if colon and all(name in FLAGS for name in names):
         message = ", ".join(FLAGS[name] for name in names) + colon + rest
     return _QUOTED.sub(_flag, message)
+
+
+def current_flags(words: Iterable[str], say: Callable[[str], None]) -> Iterator[str]:
+    """Yield the words of a command line with renamed flags replaced, saying so.
+
+    Examples
+    --------
+    >>> list(current_flags(["relight", "f.rfld", "--samples=4"], print))
+    reflfield: note: --samples is now --rays-per-pixel; it is accepted until version 0.2
+    ['relight', 'f.rfld', '--rays-per-pixel=4']
+    """
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if flag in RENAMED_FLAGS:
+            say(
+                f"reflfield: note: {flag} is now {RENAMED_FLAGS[flag]}; it is accepted until "
+                "version 0.2"
+            )
+            flag = RENAMED_FLAGS[flag]
+        yield f"{flag}{equals}{value}"
 
 
 def _flag(quoted: re.Match[str]) -> str:

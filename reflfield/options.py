@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import re
 import sys
 import tomllib
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from numbers import Integral
@@ -18,9 +19,14 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import tomli_w
 
 from reflfield.errors import InputError
+from reflfield.util.dask_cluster import check_installed
 from reflfield.util.files import read_bytes
 
+log = logging.getLogger(__name__)
 Options = TypeVar("Options")
+# Options that were renamed, by their whole names, old -> new. Old names are accepted, with one
+# line of warning, until the next minor version.
+RENAMED_OPTIONS: dict[str, str] = {}
 # A configuration file is written by hand: anything larger is another file.
 LARGEST_FILE = 1 << 20
 # Keys of very many parts take time and memory that grow with the square of their number.
@@ -120,6 +126,52 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
+def with_current_names(
+    tables: Mapping[str, Any], renamed: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Return tables in which options that were renamed have their new names.
+
+    Parameters
+    ----------
+    tables : mapping
+        By name; nested. What has the new name already wins.
+    renamed : mapping of str to str, optional
+        New names by old ones, ``table.option``; `RENAMED_OPTIONS` by default.
+
+    Examples
+    --------
+    >>> logging.disable()
+    >>> with_current_names({"hull": {"side": 64}}, {"hull.side": "hull.resolution"})
+    {'hull': {'resolution': 64}}
+    >>> logging.disable(logging.NOTSET)
+    """
+    result = dict(tables)
+    for old, new in (RENAMED_OPTIONS if renamed is None else renamed).items():
+        *above, name = old.split(".")
+        holder: Any = result
+        for part in above:
+            holder = holder.get(part) if isinstance(holder, Mapping) else None
+        if isinstance(holder, Mapping) and name in holder:
+            log.warning(
+                "option %r is now %r; the old name is accepted until version 0.2",
+                *(old, new),
+            )
+            value = holder[name]
+            result = _without(result, old.split("."))
+            for part in reversed(new.split(".")):
+                value = {part: value}
+            result = merged(value, result)
+    return result
+
+
+def _without(tables: Mapping[str, Any], path: Sequence[str]) -> dict[str, Any]:
+    """Return nested tables without the value at a path."""
+    name, *below = path
+    if below:
+        return {**tables, name: _without(tables[name], below)}
+    return {key: value for key, value in tables.items() if key != name}
+
+
 def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") -> Options:
     """Options with the values of nested tables in place of the defaults.
 
@@ -142,6 +194,8 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
     InputError
         If a name is unknown (near names are suggested) or a value has the wrong type.
     """
+    if not where:
+        tables = with_current_names(tables)
     hints = get_type_hints(type(options))
     known = [f.name for f in fields(options)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}
@@ -276,6 +330,8 @@ class Resources:
     store: str | None = None
 
     def __post_init__(self) -> None:
+        if self.scheduler is not None:
+            check_installed()
         if not 1 <= self.workers <= MOST_WORKERS:
             raise InputError(f"workers: expected 1 to {MOST_WORKERS}, received {self.workers}")
         if self.max_memory < LEAST_MEMORY:

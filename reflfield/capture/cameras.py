@@ -106,6 +106,52 @@ class Camera:
         object.__setattr__(self, "distortion", distortion)
         object.__setattr__(self, "camera_from_world", _frozen_matrix(self))
 
+    @classmethod
+    def look_at(
+        cls,
+        position: ArrayLike,
+        target: ArrayLike = (0.0, 0.0, 0.0),
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        *,
+        width: int = 512,
+        height: int = 512,
+        fov_deg: float = 30.0,
+        id: str = "camera",
+    ) -> Camera:
+        """Return a perspective camera without distortion that looks at a point.
+
+        Parameters
+        ----------
+        position, target : (3,) array_like
+            World points, metres.
+        up : (3,) array_like
+            World direction that shall point up in the image.
+        width, height : int
+            Image size, pixels.
+        fov_deg : float
+            Horizontal angle of view, degrees.
+        id : str
+
+        Raises
+        ------
+        CaptureError
+            If `position` and `target` coincide, or a number is out of range.
+
+        Examples
+        --------
+        >>> camera = Camera.look_at([0, 0, 2], up=[0, 1, 0], width=100, height=80, fov_deg=90)
+        >>> round(camera.fl_x, 6), camera.project([[1, 0, 0]])[0].round(6)
+        (50.0, array([[75., 40.]]))
+        """
+        if not 0 < fov_deg < 180:
+            raise CaptureError(
+                f"fov_deg: expected an angle between 0 and 180 degrees, received {fov_deg}"
+            )
+        focal = float(0.5 * width / np.tan(0.5 * np.radians(fov_deg)))
+        centre = 0.5 * width, 0.5 * height
+        pose = looking_at(position, target, up)
+        return cls(id, OPENCV, width, height, focal, focal, *centre, pose)
+
     @property
     def rotation(self) -> Array:
         """(3, 3) rotation part of `camera_from_world`."""

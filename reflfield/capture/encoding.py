@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
 
 from reflfield.errors import InputError
 from reflfield.util.files import read_bytes
+from reflfield.util.late_import import LateImport
+
+interpolate: Any = LateImport("scipy.interpolate")
 
 Float32 = NDArray[np.float32]
 
@@ -118,7 +120,7 @@ class Encoding:
     @cached_property
     def _curve(self) -> Any:
         points = self.pairs if self.pairs[0][0] == 0 else ((0.0, 0.0), *self.pairs)
-        return PchipInterpolator(*np.array(points, np.float64).T)
+        return interpolate.PchipInterpolator(*np.array(points, np.float64).T)
 
 
 def parse_encoding(text: str, find: Callable[[str], Path] = Path) -> Encoding:

@@ -209,6 +209,54 @@ class Light:
         return smooth * np.maximum(cosine, 0.0) ** self.exponent
 
 
+class PointLight(Light):
+    """A light at a point.
+
+    Parameters
+    ----------
+    position : (3,) array_like
+        World, metres.
+    intensity : float or (3,) array_like
+        Radiant intensity, W/sr per channel.
+    id : str
+
+    Examples
+    --------
+    >>> PointLight([0, 0, 2], 8.0).irradiance([[0, 0, 0]])
+    array([[2., 2., 2.]])
+    """
+
+    def __init__(
+        self, position: ArrayLike, intensity: ArrayLike = 1.0, *, id: str = POINT
+    ) -> None:
+        power = np.broadcast_to(np.asarray(intensity, np.float64), 3)
+        super().__init__(id, POINT, position=np.asarray(position), intensity=power)
+
+
+class DirectionalLight(Light):
+    """A light so far away that its direction is the same everywhere.
+
+    Parameters
+    ----------
+    direction : (3,) array_like
+        World, towards the light; normalised here.
+    irradiance : float or (3,) array_like
+        Of a surface that faces the light, W/m^2 per channel.
+    id : str
+
+    Examples
+    --------
+    >>> DirectionalLight([0, 0, 2], np.pi).directions([[1, 0, 0]])
+    array([[0., 0., 1.]])
+    """
+
+    def __init__(
+        self, direction: ArrayLike, irradiance: ArrayLike = 1.0, *, id: str = DIRECTIONAL
+    ) -> None:
+        power = np.broadcast_to(np.asarray(irradiance, np.float64), 3)
+        super().__init__(id, DIRECTIONAL, direction=np.asarray(direction), intensity=power)
+
+
 def _vector(light: Light, name: str) -> Array:
     vector = np.array(getattr(light, name), dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():

@@ -118,8 +118,8 @@ def _read(description: Path, format: str, *, follow_links: bool, test_split: boo
         )
     if test_split:
         raise CaptureError(
-            f"{description}: test split: expected transforms.json with one, received a "
-            f"{format} capture, which has none; hold out views=K, lights=K or "
+            f"test_split: expected transforms.json with a test split, received {description}, "
+            f"a {format} capture, which has none; hold out views=K, lights=K or "
             "photographs=K instead"
         )
     return READERS[format].read(description, follow_links=follow_links)

@@ -18,9 +18,11 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull, QhullError
 
+from reflfield.util.late_import import LateImport
 from reflfield.util.validation import unit_directions
+
+spatial: Any = LateImport("scipy.spatial")
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -169,8 +171,12 @@ def _interpolate(table: Any, directions: Any, out: Any) -> None:
 def _triangles(observed: Array) -> list[Array]:
     """Corners (3, 3), by rows, of the triangles that are no gaps."""
     try:
-        faces = ConvexHull(observed).simplices if len(observed) > 3 else np.zeros((0, 3), int)
-    except QhullError:  # all in one plane: a ring, which encloses a triangulated disk
+        faces = (
+            spatial.ConvexHull(observed).simplices
+            if len(observed) > 3
+            else np.zeros((0, 3), int)
+        )
+    except spatial.QhullError:  # all in one plane: a ring, which encloses a triangulated disk
         faces = _disk(observed)
     triangles = []
     for corners in observed[faces]:

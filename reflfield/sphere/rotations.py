@@ -10,10 +10,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
+from reflfield.util.late_import import LateImport
+
+transform: Any = LateImport("scipy.spatial.transform")
 Array = NDArray[np.float64]
 
 
@@ -37,8 +41,16 @@ def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
            [ 0.,  0.,  1.]])
     """
     q = np.asarray(quaternion, dtype=np.float64)
-    flat = Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix()
-    return flat.reshape(*q.shape[:-1], 3, 3)
+    # Written out, as scipy does it: opening a field need not import scipy.
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    entries = (
+        *(x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w),
+    )
+    return np.stack(entries, axis=-1).reshape(*q.shape[:-1], 3, 3)
 
 
 def quaternion_from_matrix(matrix: ArrayLike) -> Array:
@@ -59,7 +71,9 @@ def quaternion_from_matrix(matrix: ArrayLike) -> Array:
     array([1., 0., 0., 0.])
     """
     m = np.asarray(matrix, dtype=np.float64)
-    flat = Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(canonical=True, scalar_first=True)
+    flat = transform.Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(
+        canonical=True, scalar_first=True
+    )
     return flat.reshape(*m.shape[:-2], 4)
 
 
@@ -72,7 +86,7 @@ def rotation_angle(matrix: ArrayLike) -> Array:
     1.570796326795
     """
     m = np.asarray(matrix, dtype=np.float64)
-    flat = Rotation.from_matrix(m.reshape(-1, 3, 3)).magnitude()
+    flat = transform.Rotation.from_matrix(m.reshape(-1, 3, 3)).magnitude()
     return flat.reshape(m.shape[:-2])
 
 

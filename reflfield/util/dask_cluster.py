@@ -8,6 +8,7 @@ fetching from one that dies can leave dask's workers and scheduler waiting for e
 
 from __future__ import annotations
 
+import sys
 import time
 import uuid
 import warnings
@@ -16,14 +17,20 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NoReturn
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, NoReturn
 
-import cloudpickle
-import distributed
 from threadpoolctl import ThreadpoolController
 
 from reflfield.errors import InputError
+from reflfield.util.late_import import LateImport
 from reflfield.util.progress import report
+
+if TYPE_CHECKING:
+    import cloudpickle
+    import distributed
+else:  # installed with the extra "cluster", and imported only where a cluster computes
+    cloudpickle, distributed = LateImport("cloudpickle"), LateImport("distributed")
 
 # How often a block is tried again that failed, and how many workers may die with the same
 # one in hand: it may be what kills them.
@@ -39,9 +46,28 @@ POLLING_SECONDS = 0.02
 COUNTING_SECONDS = 1.0
 # Where workers tell that they begin a block.
 TOPIC = "reflfield-blocks-begun"
-# What the calls of a client raise when its scheduler is gone; of the first are time-outs.
-LOST = (OSError, distributed.client.ClosedClientError)
 GO_ON = "run the same command again, which goes on from the blocks that are finished"
+
+
+def check_installed() -> None:
+    """Demand what computes on a cluster, which is not installed with all else.
+
+    Raises
+    ------
+    InputError
+        If it is missing; the message says how it is installed.
+    """
+    missing = [name for name in ("dask", "distributed", "cloudpickle") if not find_spec(name)]
+    if missing:
+        raise InputError(
+            f"scheduler: expected the packages of a dask cluster, found no "
+            f'{", ".join(missing)}; install them with: pip install "reflfield[cluster]"'
+        )
+
+
+def _lost_errors() -> tuple[type[Exception], ...]:
+    """What the calls of a client raise when its scheduler is gone; of the first: time-outs."""
+    return (OSError, distributed.client.ClosedClientError)
 
 
 class ClusterWork:
@@ -135,14 +161,14 @@ class ClusterWork:
                 yield client
         finally:
             # A scheduler that is gone does not say goodbye.
-            with suppress(*LOST):
+            with suppress(*_lost_errors()):
                 client.close(timeout=CLOSING_SECONDS)
 
     @contextmanager
     def _needing_the_scheduler(self) -> Iterator[None]:
         try:
             yield
-        except LOST as error:
+        except _lost_errors() as error:
             self._lost(error)
 
     def _lost(self, error: BaseException | None) -> NoReturn:
@@ -283,6 +309,8 @@ def threads_here(otherwise: int) -> int:
     int
         On a cluster's worker, as many as it was started with, wherever the job runs.
     """
+    if "distributed" not in sys.modules:  # nor is this a worker
+        return otherwise
     try:
         return int(distributed.get_worker().state.nthreads)
     except ValueError:  # no worker is computing this

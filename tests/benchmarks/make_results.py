@@ -28,8 +28,7 @@ HEAD = """# Results
 
 Written by `python tests/benchmarks/make_results.py` from `results/*.json`; do not edit. Each
 section names the command that measured it, the day, the commit (a + where the tree differed
-from it), the machine and its load, which is the number of cores that the command used where
-nothing else ran.
+from it) and the machine.
 """
 MARK = "> Older than the code: "
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
@@ -137,8 +136,7 @@ def section(result):
         f"## {result['title']}\n",
         f"`{result['command']}`\n",
         f"{result['date']}, commit {result['commit'] or 'unknown'}; {machine['processor']}, "
-        f"{machine['cores']} cores, {machine['memory_gb']} GB, load "
-        f"{machine.get('load', 'unknown')}; {said}.\n",
+        f"{machine['cores']} cores, {machine['memory_gb']} GB; {said}.\n",
         *(f"{line}\n" for line in mark(result)),
     ]
     for table in result["tables"]:

@@ -216,13 +216,12 @@ def commit():
 
 
 def machine():
-    """Processor, cores that this process may use, memory, and how busy all of it is."""
+    """Processor, cores that this process may use, memory."""
     names = re.findall(r"^model name\s*:\s*(.+)$", read_if_there("/proc/cpuinfo"), re.MULTILINE)
     return {
         "processor": names[0] if names else platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
-        "load": round(os.getloadavg()[1], 1),  # runnable processes, five minutes' mean
     }
 
 

@@ -321,7 +321,7 @@ class TestRelightArguments:
     @pytest.mark.parametrize(
         ("words", "expected"),
         [
-            ((), ("--frames", "--orbit")),
+            ((), ("--capture", "--orbit")),
             (("--orbit", "3"), ("--environment", "--light")),
             (("--orbit", "3", "--light", "up"), ("--light", "X,Y,Z", "'up'")),
             (("--orbit", "3", "--light", "0,0,0"), ("--light", "zero")),
@@ -329,12 +329,12 @@ class TestRelightArguments:
             (("--orbit", "0", "--light", "1,0,1"), ("n_frames", "1 to 3600", "0")),
             (("--orbit", "3", "--light", "1,0,1", "--size", "0"), ("size", "1 to 16383", "0")),
             (
-                ("--orbit", "3", "--light", "1,0,1", "--samples", "3"),
+                ("--orbit", "3", "--light", "1,0,1", "--rays-per-pixel", "3"),
                 ("samples", "square", "3"),
             ),
             (("--orbit", "3", "--environment", "no.exr"), ("no.exr",)),
-            (("--frames", "nowhere"), ("nowhere", "does not exist")),
-            (("--frames", "nowhere", "--light", "1,0,1"), ("--light", "--orbit")),
+            (("--capture", "nowhere"), ("nowhere", "does not exist")),
+            (("--capture", "nowhere", "--light", "1,0,1"), ("--light", "--orbit")),
         ],
     )
     def test_refused(self, reflfield, refused, finished, tmp_path, words, expected):

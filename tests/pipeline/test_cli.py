@@ -114,7 +114,7 @@ class TestProgress:
         )
         outcome = reflfield(
             *("relight", finished.folder / "field.rfld", "-o", tmp_path / "out"),
-            *("--frames", tiny_capture / "truth" / "heldout.json", "--samples", "1"),
+            *("--capture", tiny_capture / "truth" / "heldout.json", "--rays-per-pixel", "1"),
         )
         assert outcome.status == 0
         assert re.search(r"relighting: 1 of 2, 0:\d\d left", outcome.err)
@@ -137,7 +137,9 @@ class TestRelight:
     def test_frames(self, reflfield, finished, tiny_capture, tmp_path):
         frames, out = tiny_capture / "truth" / "heldout.json", tmp_path / "out"
         field = finished.folder / "field.rfld"
-        outcome = reflfield("relight", field, "--frames", frames, "-o", out, "--samples", "1")
+        outcome = reflfield(
+            "relight", field, "--capture", frames, "-o", out, "--rays-per-pixel", "1"
+        )
         assert outcome.status == 0
         assert outcome.out.splitlines() == [str(out / f"h00{i}.exr") for i in (0, 1)]
         assert {p.name for p in out.iterdir()} == {
@@ -148,7 +150,7 @@ class TestRelight:
         out = tmp_path / "out"
         outcome = reflfield(
             *("relight", finished.folder / "field.rfld", "-o", out, "--orbit", "2"),
-            *("--light", "1,0,1", "--samples", "1", "--size", "32"),
+            *("--light", "1,0,1", "--rays-per-pixel", "1", "--size", "32"),
         )
         assert outcome.status == 0
         made = outcome.out.splitlines()
@@ -159,14 +161,14 @@ class TestRelight:
     def test_field_alone_is_enough(self, reflfield, finished, tiny_capture, tmp_path):
         field = shutil.copy(finished.folder / "field.rfld", tmp_path / "moved.rfld")
         frames = tiny_capture / "truth" / "heldout.json"
-        words = ("--frames", frames, "-o", tmp_path / "out", "--samples", "1")
+        words = ("--capture", frames, "-o", tmp_path / "out", "--rays-per-pixel", "1")
         assert reflfield("relight", field, *words).status == 0
 
 
 def test_compare_prints_and_writes_metrics(reflfield, finished, tiny_capture, tmp_path):
     out, frames = tmp_path / "out", tiny_capture / "truth" / "heldout.json"
     field = finished.folder / "field.rfld"
-    outcome = reflfield("compare", field, frames, "-o", out, "--samples", "1")
+    outcome = reflfield("compare", field, frames, "-o", out, "--rays-per-pixel", "1")
     assert outcome.status == 0
     assert "2 frames: PSNR" in outcome.out
     assert (out / "metrics.json").is_file()
@@ -209,11 +211,11 @@ class TestNothingIsLeftAfterAnError:
         )
         words = {
             "compare": ("compare", field, frames, "-o", out),
-            "frames": ("relight", field, "--frames", frames, "-o", out),
+            "frames": ("relight", field, "--capture", frames, "-o", out),
             "orbit": ("relight", field, "--orbit", "2", "--light", "1,0,1", "--size", "32",
                       "-o", out),
         }[command]  # fmt: skip
-        outcome = reflfield(*words, "--samples", "1")
+        outcome = reflfield(*words, "--rays-per-pixel", "1")
         assert outcome.status == 2
         assert "planted" in outcome.err
         left = [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))]
@@ -228,10 +230,18 @@ class TestNothingIsLeftAfterAnError:
         field, photographs = finished.folder / "field.rfld", capture_copy / "photographs"
         before = {path.name: path.read_bytes() for path in photographs.iterdir()}
         for _ in range(2):
-            words = ("compare", field, capture_copy, "-o", capture_copy, "--samples", "1")
+            words = (
+                "compare",
+                field,
+                capture_copy,
+                "-o",
+                capture_copy,
+                "--rays-per-pixel",
+                "1",
+            )
             assert reflfield(*words).status == 0
-        words = ("relight", field, "--frames", capture_copy, "-o", photographs)
-        outcome = reflfield(*words, "--samples", "1")
+        words = ("relight", field, "--capture", capture_copy, "-o", photographs)
+        outcome = reflfield(*words, "--rays-per-pixel", "1")
         assert outcome.status == 2
         assert "v000_l000.exr: expected a folder for results" in outcome.err
         assert {path.name: path.read_bytes() for path in photographs.iterdir()} == before
@@ -253,7 +263,7 @@ def test_compare_without_silhouettes_measures_the_whole_object(
     described(capture_copy, two_frames)
     write_exr(capture_copy / "photographs" / "v005_l002.exr", np.zeros((32, 32, 3), np.float32))
     words = ("compare", finished.folder / "field.rfld", capture_copy, "-o", tmp_path / "out")
-    outcome = reflfield(*words, "--samples", "1")
+    outcome = reflfield(*words, "--rays-per-pixel", "1")
     assert outcome.status == 0, outcome.err
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     truth = read_coverage(capture_copy / "silhouettes" / "v005.png")

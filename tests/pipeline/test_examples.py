@@ -1,11 +1,15 @@
-"""The example scripts run as their own text says."""
+"""The example scripts run as their own text says, and so does that of the package."""
 
 import csv
+import doctest
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+
+import reflfield as package
 
 TINY_SCENE = """
 [object]
@@ -74,6 +78,18 @@ def test_accuracy_against_time(subprocess_run, tmp_path):
     assert float(rows["exact"]["normals"]) < 0.5 * float(rows["K=4"]["normals"])
     assert float(rows["exact"]["milliseconds"]) < float(rows["brute force"]["milliseconds"])
     assert np.asarray(Image.open(tmp_path / "accuracy_against_time.png")).std() > 20
+
+
+@pytest.mark.slow
+def test_the_example_of_the_package_runs_whole(tiny_capture, tmp_path, monkeypatch):
+    """The lines that doctest skips, too, with the capture that they name."""
+    shutil.copytree(tiny_capture, tmp_path / "capture")
+    monkeypatch.chdir(tmp_path)
+    text = package.__doc__.replace("# doctest: +SKIP", "").replace("27.2", "...")
+    example = doctest.DocTestParser().get_doctest(text, {}, "reflfield", None, None)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    assert runner.run(example).failed == 0
+    assert (tmp_path / "out" / "field.rfld").is_file()
 
 
 @pytest.mark.slow

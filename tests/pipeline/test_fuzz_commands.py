@@ -42,7 +42,15 @@ OF_RUN = (
 )
 OF_RELIGHT = (
     *("--orbit", "--environment", "--convention", "--environment-up", "--environment-rotation"),
-    *("--light", "--samples", "--size", "--elevation", "--workers", "--max-memory", "--frames"),
+    *(
+        "--light",
+        "--rays-per-pixel",
+        "--size",
+        "--elevation",
+        "--workers",
+        "--max-memory",
+        "--capture",
+    ),
 )
 
 
@@ -144,7 +152,18 @@ def fuzz_settings(answered, capture, out, rng, count):
 def fuzz_words(answered, capture, field, out, rng, count):
     """Options of the commands themselves with junk."""
     run = ("run", capture, "--until", "silhouettes")
-    relight = ("relight", field, "--light", "1,0,1", "--orbit", 1, "--samples", 1, "--size", 8)
+    relight = (
+        "relight",
+        field,
+        "--light",
+        "1,0,1",
+        "--orbit",
+        1,
+        "--rays-per-pixel",
+        1,
+        "--size",
+        8,
+    )
     for command, names in ((run, OF_RUN), (relight, OF_RELIGHT)):
         for name in names:
             for _ in range(count):
@@ -162,7 +181,7 @@ def fuzz_descriptions(answered, capture, field, out, rng, count):
         (capture / "capture.json").write_text(json.dumps(document))
         answered("inspect", capture)
         answered("run", capture, "-o", out, "--until", "hull", "--set", "hull.resolution=16")
-        answered("relight", field, "--frames", capture, "--samples", 1, "-o", out)
+        answered("relight", field, "--capture", capture, "--rays-per-pixel", 1, "-o", out)
         shutil.rmtree(out, ignore_errors=True)
 
 
@@ -173,7 +192,7 @@ def fuzz_fields(answered, field, out, rng, count):
         field.write_bytes(damage(rng, content))
         answered("inspect", field)
         answered(
-            *("relight", field, "--light", "1,0,1", "--orbit", 1, "--samples", 1),
+            *("relight", field, "--light", "1,0,1", "--orbit", 1, "--rays-per-pixel", 1),
             *("--size", 8, "-o", out),
         )
         shutil.rmtree(out, ignore_errors=True)

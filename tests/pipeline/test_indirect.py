@@ -129,7 +129,7 @@ def test_the_inside_of_a_hole_does_not_glow_under_lights_from_below(
         *("--set", "comparison.without_alignment=false", "--until", "compression"),
     )
     assert outcome.status == 0, outcome.err
-    words = ("compare", field, ring / "below", "-o", out, "--samples", "4")
+    words = ("compare", field, ring / "below", "-o", out, "--rays-per-pixel", "4")
     assert reflfield(*words).status == 0
     mean = json.loads((out / "metrics.json").read_text())["mean"]
     # 19.2 before; so coarse a field differs by some tenths from machine to machine.

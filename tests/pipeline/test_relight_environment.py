@@ -34,7 +34,15 @@ def lit_from(reflfield, ball, tmp_path):
         write_exr(tmp_path / "sky.exr", radiance)
         outcome = reflfield(
             *("relight", ball, "-o", tmp_path / "out", "--orbit", "1", "--elevation", "0"),
-            *("--environment", tmp_path / "sky.exr", "--samples", "4", "--size", "48", *words),
+            *(
+                "--environment",
+                tmp_path / "sky.exr",
+                "--rays-per-pixel",
+                "4",
+                "--size",
+                "48",
+                *words,
+            ),
         )
         assert outcome.status == 0, outcome.err
         picture = np.asarray(Image.open(tmp_path / "out/orbit_000.png"), np.float64).sum(axis=2)
@@ -103,8 +111,8 @@ def test_turns_that_are_none_are_refused(reflfield, ball, tmp_path, words, messa
         ("--orbit", "1", "--light", "0,0,1", "--environment-up", "Z"),
         ("--orbit", "1", "--light", "0,0,1", "--environment-rotation", "0"),
         ("--orbit", "1", "--light", "0,0,1", "--convention", "blender"),
-        ("--frames", "frames.json", "--size", "64"),
-        ("--frames", "frames.json", "--elevation", "10"),
+        ("--capture", "frames.json", "--size", "64"),
+        ("--capture", "frames.json", "--elevation", "10"),
     ],
 )
 def test_options_that_would_be_ignored_are_refused(reflfield, ball, tmp_path, words):

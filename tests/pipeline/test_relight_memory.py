@@ -71,8 +71,8 @@ def test_frames_beyond_the_ceiling_are_refused(
         picture = np.zeros((width, width, 1), np.float32)
         picture[:200] = rng.random((200, width, 1))
         write_exr(where / "a.exr", picture, names=["Y"])
-    words = ("--frames", where) if command == "relight" else (where,)
-    limit = ("--max-memory", "2GB", "--samples", "1")
+    words = ("--capture", where) if command == "relight" else (where,)
+    limit = ("--max-memory", "2GB", "--rays-per-pixel", "1")
     outcome = reflfield(command, ball_file, *words, "-o", tmp_path / "out", *limit)
     assert outcome.status == 2, outcome
     assert "--max-memory: expected at least" in outcome.err
@@ -89,7 +89,7 @@ def test_what_would_suffice_does(ball):
     # Blocks grow with the ceiling up to 4096 pixels each.
     blocks = 2 * 4096 * 4096 * 4
     check_picture_memory(ball, Resources(2, int(enough * GB) + blocks), options, **picture)
-    with pytest.raises(Exception, match="--max-memory"):
+    with pytest.raises(Exception, match="max_memory"):
         check_picture_memory(ball, Resources(2, int(0.9 * enough * GB)), options, **picture)
 
 

@@ -1,0 +1,1 @@
+"""What `import reflfield` offers beside classes of the other packages: captures to results."""

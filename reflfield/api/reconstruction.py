@@ -1,0 +1,167 @@
+"""From a capture to a field: the whole pipeline in one call."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from reflfield.api.captures import open_capture
+from reflfield.api.fields import Field, open_field
+from reflfield.capture.capture import Capture
+from reflfield.options import (
+    HoldOut,
+    Resources,
+    merged,
+    parse_settings,
+    read_toml,
+    with_tables,
+)
+from reflfield.pipeline.cache import StageRecord
+from reflfield.pipeline.context import Job
+from reflfield.pipeline.hold_out import held_out_words, left_out_words
+from reflfield.pipeline.model_selection import words_of
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.pipeline.publishing import published
+from reflfield.pipeline.quantisation_search import missed_quality
+from reflfield.pipeline.report import problems_of
+from reflfield.pipeline.stages import run
+
+
+@dataclass(frozen=True)
+class Result:
+    """What `reconstruct` made.
+
+    Parameters
+    ----------
+    folder : Path
+        Of all results.
+    metrics : dict
+        Content of ``metrics.json``: ``mean`` over the held-out photographs and each of them;
+        empty where nothing was compared.
+    files : tuple of Path
+        Results, the field first.
+    stages : tuple of StageRecord
+        Time, memory and counts of each stage.
+    notes : tuple of str
+        Sentences: what was held out, selected, or could not be compared.
+    missed_quality : str
+        Of a quality that was asked for and is not reached; empty where it is.
+    """
+
+    folder: Path
+    metrics: dict[str, Any]
+    files: tuple[Path, ...]
+    stages: tuple[StageRecord, ...]
+    notes: tuple[str, ...]
+    missed_quality: str = ""
+
+    @cached_property
+    def field(self) -> Field:
+        """The field, opened from its file."""
+        return open_field(self.folder / "field.rfld")
+
+
+def reconstruct(
+    capture: Capture | Path | str,
+    out: Path | str,
+    *,
+    hold_out: HoldOut | None = None,
+    options: PipelineOptions | Mapping[str, Any] | None = None,
+    resources: Resources | None = None,
+    from_stage: str | None = None,
+    until: str = "report",
+) -> Result:
+    """Make a relightable field of a capture, and say how good it is.
+
+    Whatever an earlier call has left in `out`, finished or not, is used again as far as capture
+    and options are the same.
+
+    Parameters
+    ----------
+    capture : Capture, Path or str
+        See `open_capture`.
+    out : Path or str
+        Folder for all results; created.
+    hold_out : HoldOut, optional
+        What is kept for comparison; nothing by default.
+    options : PipelineOptions or mapping, optional
+        Of the stages; a mapping holds tables as in a TOML file, such as
+        ``{"hull": {"resolution": 64}}``.
+    resources : Resources, optional
+        Threads, memory, cluster. They do not affect the result.
+    from_stage : str, optional
+        Compute this stage and all later ones again, even if nothing has changed.
+    until : str
+        Stop after this stage.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If capture, options or a stage's name cannot be used.
+    GeometryError
+        If the silhouettes do not determine a surface.
+    """
+    held, limits = hold_out or HoldOut(), resources or Resources()
+    folder = Path(out)
+    if limits.scheduler is not None:  # whose workers run in folders of their own
+        folder = folder.resolve()
+    if not isinstance(capture, Capture):
+        capture = open_capture(Path(capture).resolve(), test_split=held.test)
+    if not isinstance(options, PipelineOptions):
+        options = with_tables(PipelineOptions(), options or {})
+    job = run(
+        capture, folder, options, hold_out=held, resources=limits, first=from_stage, last=until
+    )
+    return _result(job)
+
+
+def _result(job: Job) -> Result:
+    compared = job.stages.record("comparison") is not None
+    notes = (
+        f"held out: {held_out_words(job.split)}",
+        *left_out_words(job.capture, job.split),
+        *words_of(job),
+        *problems_of(job),
+    )
+    return Result(
+        folder=job.out,
+        metrics=json.loads((job.out / "metrics.json").read_text()) if compared else {},
+        files=tuple(published(job)),
+        stages=tuple(job.stages.records),
+        notes=notes,
+        missed_quality=missed_quality(job),
+    )
+
+
+def read_options(
+    path: Path | str | None = None, settings: Iterable[str] = ()
+) -> PipelineOptions:
+    """Return options of a TOML file, overridden by single settings.
+
+    Parameters
+    ----------
+    path : Path or str, optional
+        Defaults hold for what it leaves out.
+    settings : iterable of str
+        ``stage.option=value``.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown or a value has the wrong type.
+
+    Examples
+    --------
+    >>> read_options(settings=["hull.resolution=64"]).hull.resolution
+    64
+    """
+    tables = read_toml(Path(path)) if path is not None else {}
+    return with_tables(PipelineOptions(), merged(tables, parse_settings(settings)))
