@@ -70,5 +70,5 @@ def infer_coefficients(
         noise=float(max((completion.noise / scale) ** 2, 1e-30)),
         n_channels=n_channels,
     )
-    coefficients, coverage = map_coefficients(reader, model.quieted(), block)
+    coefficients, coverage, _ = map_coefficients(reader, model.quieted(), block)
     return (coefficients * scale).astype(np.float32), coverage

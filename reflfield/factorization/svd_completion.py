@@ -63,10 +63,12 @@ class Completion:
         basis that the pass began with.
     coverage : (n_columns,) float32
         Observed share of each column (mean of the weights). A column of which nothing was
-        observed equals `mean`; a row of which nothing was, is zero.
+        observed equals `mean`.
     sparse_columns : (n_columns,) bool
         True where less than 2 % was observed (empty ones included); these
         were completed but did not shape basis, mean and noise.
+    empty_rows : (n_rows,) bool
+        True where no column was observed; such a row is zero.
     restarts : int
         Column orders tried and abandoned before this fit.
     """
@@ -78,6 +80,7 @@ class Completion:
     residuals: tuple[float, ...]
     coverage: NDArray[np.float32]
     sparse_columns: NDArray[np.bool_]
+    empty_rows: NDArray[np.bool_]
     restarts: int = 0
 
     @property
@@ -272,23 +275,25 @@ def one_pass(
 
 def map_coefficients(
     reader: Reader, model: Model, block: int
-) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
-    """Coefficients about the prior mean, and coverage of columns."""
-    n_columns = reader.source.shape[1]
+) -> tuple[NDArray[np.floating], NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients about the prior mean, coverage of columns, and total weight of samples."""
+    n_rows, n_columns = reader.source.shape
     coefficients = np.zeros((n_columns, model.rank), dtype=reader.dtype)
     coverage = np.zeros(n_columns)
+    sample_weight = np.zeros(n_rows // model.n_channels)
     gram = gram_of_samples(model.basis, model.n_channels)
     for columns in blocks_of(np.arange(n_columns), block):
         data = reader.block(columns)
         coefficients[columns] = infer(model, data, gram).mean - model.prior_mean
         coverage[columns] = data.coverage
-    return coefficients, coverage
+        sample_weight += data.weights.sum(axis=1)
+    return coefficients, coverage, sample_weight
 
 
 def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
     """Read all columns once more for coefficients and flags; back to the caller's unit."""
     model, scale, dtype = fit.model, reader.scale, reader.dtype
-    coefficients, coverage = map_coefficients(reader, model, block)
+    coefficients, coverage, sample_weight = map_coefficients(reader, model, block)
     mean = model.offset + model.basis @ model.prior_mean
     return Completion(
         basis=model.basis,
@@ -298,5 +303,6 @@ def _finish(reader: Reader, fit: Fit, block: int, restarts: int) -> Completion:
         residuals=tuple(residual * scale for residual in fit.residuals),
         coverage=coverage.astype(np.float32),
         sparse_columns=coverage < reader.least_coverage,
+        empty_rows=np.repeat(sample_weight == 0, model.n_channels),
         restarts=restarts,
     )

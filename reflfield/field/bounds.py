@@ -13,9 +13,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.observations.texel_samples import Channels
+from reflfield.field.clustered_model import ClusteredModel
+from reflfield.field.sample_sums import KernelSamples, kernel_samples
+from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, TransformedSamples
 
 Floats = NDArray[np.float32]
+Ints = NDArray[np.int32]
 
 # A texel is nowhere brighter than its brightest sample, or than this many times the mean of
 # its cluster there, in the domain: of cube roots, 2.7 times in radiance.
@@ -99,3 +102,68 @@ def exceeds(at_probes: Floats, coefficients: Floats, top: Floats) -> bool:
             if value > max(top[c], MOST_OF_MEAN * mean):
                 return True
     return False
+
+
+def beyond_bounds(
+    transformed: TransformedSamples, cluster: Ints, coefficients: Floats, at_probes: Floats
+) -> NDArray[np.bool_]:
+    """Which texels are somewhere brighter than their samples and their clusters allow.
+
+    Parameters
+    ----------
+    transformed : TransformedSamples
+        Samples of n texels.
+    cluster : (n,) int32
+    coefficients : (n, K) float32
+    at_probes : (n_clusters, n_probes, K + 1, 3) float32
+        See `probes`.
+
+    Returns
+    -------
+    (n,) bool
+    """
+    beyond = np.zeros(len(cluster), np.bool_)
+    samples = kernel_samples(transformed, slice(None))
+    _mark_beyond(samples, cluster, coefficients, at_probes, beyond)
+    return beyond
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_beyond(
+    samples: KernelSamples,
+    cluster: Ints,
+    coefficients: Floats,
+    at_probes: Floats,
+    beyond: NDArray[np.bool_],
+) -> None:
+    every = np.full(samples.values.shape[2], ALL_CHANNELS, np.uint8)
+    for t in range(len(samples.values)):
+        top = np.zeros(3, np.float32)
+        for i in np.flatnonzero(samples.view_weights[t]):
+            weights = samples.view_weights[t, i] * samples.light_weights[t] * samples.pairs[i]
+            measured = samples.channels[t, i] if len(samples.channels) else every
+            raise_top(samples.values[t, i], weights, measured, top)
+        beyond[t] = exceeds(at_probes[cluster[t]], coefficients[t], top)
+
+
+def beyond_clusters(model: ClusteredModel, texels: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Those texels that are somewhere brighter than their clusters allow.
+
+    Samples may still show them to be as bright: see `beyond_bounds`.
+    """
+    beyond = np.zeros(len(texels), np.bool_)
+    at_probes, dark = probes(model.table), np.zeros(3, np.float32)
+    _mark_brighter(model.cluster[texels], model.coefficients[texels], at_probes, dark, beyond)
+    return texels[beyond]
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_brighter(
+    cluster: Ints,
+    coefficients: Floats,
+    at_probes: Floats,
+    top: Floats,
+    beyond: NDArray[np.bool_],
+) -> None:
+    for t in range(len(cluster)):
+        beyond[t] = exceeds(at_probes[cluster[t]], coefficients[t], top)

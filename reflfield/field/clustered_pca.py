@@ -8,6 +8,7 @@ result is that of local PCA on the completed columns.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import isqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from reflfield.factorization import Completion, LocalPCA
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.half_vector import HalfVectorOptions
 from reflfield.field.sample_fit import SampleFitOptions
+from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.util.validation import check_ranges
 
 Floats = NDArray[np.float32]
@@ -29,6 +31,9 @@ MOST_SAMPLES = 4096
 
 # Noise and coefficients have at least this share of the largest variance of a coefficient.
 LEAST_SPREAD = 1e-9
+
+# Pairs of nodes that one which no texel showed is a mean of, the less the farther.
+NEAREST_PAIRS = 8
 
 
 # Models of a field.
@@ -162,6 +167,7 @@ def cluster_completed(
     table = np.concatenate([means[:, :, None], bases], axis=2)
     table = table.reshape(len(means), *node_counts, 3, n_components + 1)
     table = np.swapaxes(table, 3, 4).reshape(len(means), *node_counts, -1)
+    _fill_empty_nodes(table, completion.empty_rows.reshape(*node_counts, 3)[..., 0])
     # Of the coefficients in an orthonormal basis; here per row of the columns.
     left_out = local.residual**2 * completion.rank / len(completion.mean)
     model = ClusteredModel(
@@ -176,6 +182,26 @@ def cluster_completed(
     model.cluster[observed] = local.labels
     model.coefficients[observed] = local.coefficients
     return model
+
+
+def _fill_empty_nodes(table: NDArray[np.floating], empty: NDArray[np.bool_]) -> None:
+    """Give pairs of nodes that no texel showed what the nearest pairs have that some did.
+
+    The completion leaves them black. `table` is (n_clusters, n_view_nodes, n_light_nodes, n),
+    `empty` (n_view_nodes, n_light_nodes).
+    """
+    if not empty.any() or empty.all():
+        return
+    view, light = (HemisphereGrid(isqrt(n)).directions for n in empty.shape)
+    v, m = np.nonzero(empty)
+    known = np.nonzero(~empty)
+    near = cKDTree(np.hstack([view[known[0]], light[known[1]]]))
+    count = min(NEAREST_PAIRS, len(known[0]))
+    distance, index = near.query(np.hstack([view[v], light[m]]), k=range(1, count + 1))
+    weights = 1.0 / np.square(distance)
+    weights /= weights.sum(axis=1, keepdims=True)
+    from_known = table[:, known[0][index], known[1][index]]
+    table[:, v, m] = np.einsum("cnkf,nk->cnf", from_known, weights)
 
 
 def _precision(

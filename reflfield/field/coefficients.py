@@ -30,7 +30,7 @@ Ints = NDArray[np.int32]
 
 # The prior of a texel beyond its bounds grows by this, so many times at most.
 STRENGTHENING, STRENGTHENINGS = 4.0, 8
-# Standard deviations that coefficients may thereby differ from what the samples give.
+# Standard deviations that coefficients may differ from what the samples give.
 ALLOWED_DEVIATION = 3.0
 
 
@@ -99,6 +99,7 @@ def _solve_bounded(
     n_values: int,
     at_probes: Floats,
     top: Floats,
+    deviation: float,
     coefficients: Floats,
     squares: NDArray[np.float64],
 ) -> None:
@@ -110,7 +111,7 @@ def _solve_bounded(
     before = squares.copy()
     _solve_texel(normal, right, precision, n_values, coefficients, squares)
     noise = max(squares[0] / max(squares[1], 1e-30), np.trace(precision) / len(right))
-    most = squares[0] + ALLOWED_DEVIATION**2 * len(right) * noise
+    most = squares[0] + deviation**2 * len(right) * noise
     step = 0
     while step < STRENGTHENINGS and exceeds(at_probes, coefficients, top):
         step += 1
@@ -141,6 +142,7 @@ def _solve_coefficients(
     table: Floats,
     precision: NDArray[np.float64],
     at_probes: Floats,
+    deviation: float,
     coefficients: Floats,
     squares: NDArray[np.float64],
 ) -> None:
@@ -176,7 +178,7 @@ def _solve_coefficients(
         if squares[t, 1] > 0 and n_components > 0:
             c = cluster[t]
             _solve_bounded(
-                *(normal, right, precision[c], n_values, at_probes[c], top),
+                *(normal, right, precision[c], n_values, at_probes[c], top, deviation),
                 *(coefficients[t], squares[t]),
             )
 
@@ -188,6 +190,7 @@ def solve_coefficients(
     pool: ThreadPoolExecutor,
     *,
     bounded: bool = False,
+    deviation: float = ALLOWED_DEVIATION,
 ) -> tuple[Floats, NDArray[np.float64]]:
     """Coefficients of texels for a fixed basis.
 
@@ -202,6 +205,8 @@ def solve_coefficients(
     bounded : bool
         Whether a texel may be nowhere brighter than its samples and, by a factor, than the
         mean of its cluster: where it was not observed its coefficients are undetermined.
+    deviation : float
+        Standard deviations that coefficients may thereby differ from what the samples give.
 
     Returns
     -------
@@ -223,6 +228,7 @@ def solve_coefficients(
             model.table,
             model.precision,
             at_probes,
+            deviation,
             coefficients[part],
             squares[part],
         )

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.field.bounds import beyond_bounds, beyond_clusters, probes
 from reflfield.field.clustered_model import (
     ClusteredModel,
+    normalised,
     of_usual_size,
     on_refined_grid,
     refined_sides,
@@ -28,6 +30,13 @@ from reflfield.util.blocks import Blocks
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
+
+# Standard deviations by which a texel's coefficients may differ from what its samples give to
+# keep it within its bounds: a basis of the grids, which nothing smooths, leads farther astray
+# between observed directions than one of the samples.
+GRID_DEVIATION = 6.0
+# Texels whose samples say how large the errors of a model of the grids are.
+TEXELS_FOR_NOISE = 512
 
 
 def fitted_model(
@@ -80,7 +89,7 @@ class _Fitting:
         """Model, and the reader in frames that were improved on the way; `name` is its own."""
         model = self.on_grid(options)
         if not self.fits_samples(options):
-            return model, self.reader
+            return _within_bounds(self.job, model, self.reader, self.blocks, name), self.reader
         free = self.found.frames.free
         model = of_usual_size(model)
         return _fitted_to_samples(self.job, model, self.reader, free, self.blocks, name)
@@ -177,6 +186,32 @@ def _fitted_once(
     return replace(found, coefficients=coefficients)
 
 
+def _within_bounds(
+    job: Job, model: ClusteredModel, reader: TexelReader, blocks: Blocks, name: str
+) -> ClusteredModel:
+    """Model of the grids whose texels are bounded where they were not observed.
+
+    Those that are brighter there than their samples and their clusters allow are solved for
+    on their samples, with as strong a prior as holds them.
+    """
+    suspects = beyond_clusters(model, job.seen_texels)
+    if not len(suspects):
+        return model
+    noise = blocks.once(
+        f"errors of the samples{name}", lambda: {"noise": _noise(job, model, reader)}
+    )["noise"]
+    model = normalised(model, float(noise), job.seen_texels)
+    parts = blocks.map(
+        f"coefficients within bounds{name}",
+        bounded_block,
+        SampleFit(reader, model, 0.0),
+        reader.blocks_of(suspects),
+    )
+    coefficients = model.coefficients.copy()
+    coefficients[suspects] = parts.joined("coefficients")
+    return replace(model, coefficients=coefficients)
+
+
 @dataclass(frozen=True, eq=False)
 class SampleFit:
     """What all blocks of texels share that are fitted to their samples.
@@ -210,3 +245,30 @@ def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]
             bounded=True,
         )
     return {"coefficients": found}
+
+
+def _noise(job: Job, model: ClusteredModel, reader: TexelReader) -> NDArray[np.float64]:
+    """Variance of samples about the model of the grids, from some texels."""
+    seen, most = job.seen_texels, job.options.compression.samples.max_bytes
+    count = min(len(seen), TEXELS_FOR_NOISE, max(1, most // reader.sample_bytes_per_texel))
+    some = np.sort(np.random.default_rng(job.options.seed).choice(seen, count, replace=False))
+    usual = normalised(model, model.residuals[-1] ** 2, seen)
+    with ThreadPoolExecutor(1) as pool:
+        _, squares = solve_coefficients(
+            reader.transformed(some), usual.cluster[some], usual, pool
+        )
+    return np.asarray(squares[:, 0].sum() / max(squares[:, 1].sum(), 1e-30))
+
+
+def bounded_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
+    """Coefficients of some texels; of those beyond their bounds, ones within."""
+    model, samples = context.model, context.reader.transformed(texels)
+    cluster, coefficients = model.cluster[texels], model.coefficients[texels]
+    beyond = beyond_bounds(samples, cluster, coefficients, probes(model.table))
+    if beyond.any():
+        with ThreadPoolExecutor(1) as pool:
+            found, _ = solve_coefficients(
+                samples, cluster, model, pool, bounded=True, deviation=GRID_DEVIATION
+            )
+        coefficients[beyond] = found[beyond]
+    return {"coefficients": coefficients}

@@ -51,6 +51,16 @@ class TestClusters:
         # Five components in float32.
         assert np.abs(predicted(model) - columns).max() < 1e-5 * np.abs(columns).max()
 
+    def test_pairs_of_nodes_that_no_texel_showed_are_as_their_neighbours(self, rng):
+        albedo = 1 + rng.random(60)
+        columns = np.repeat(albedo[None], COUNTS[0] * COUNTS[1] * 3, axis=0)
+        columns.reshape(*COUNTS, 3, -1)[1, 4:] = np.nan
+        completion = complete(columns, rank=1)
+        model = clustered(completion, n_clusters=1, n_components=1)
+        # The completion's prior draws rows towards zero by a share of the noise.
+        shown = predicted(model)
+        assert np.abs(shown / albedo[:, None] - 1).max() < 1e-3
+
     def test_more_clusters_and_components_fit_better(self, completed):
         completion, columns = completed
 
