@@ -119,6 +119,7 @@ def process_words(
     options = {
         "atlas.resolution": texels,
         "completion.training_texels": training,
+        "compression.model": "clustered",
         "compression.training_texels": training,
     }
     settings = [word for item in options.items() for word in ("--set", "{}={}".format(*item))]

@@ -46,10 +46,12 @@ class CompressionOptions:
 
     Parameters
     ----------
-    model : {"clustered", "half_vector"}
+    model : {"auto", "clustered", "half_vector"}
         "clustered": clustered local PCA in aligned frames, as in the paper. "half_vector":
         functions of the half vector that all texels share, with coefficients and frames of
-        each texel fitted to the photographs; the lights must be known.
+        each texel fitted to the photographs; the lights must be known. "auto" takes
+        "half_vector" for a solid object under known lights where a texel has enough samples
+        and neither `fit` nor `comparison.without_alignment` asks for the other.
     half_vector : HalfVectorOptions
     n_clusters, n_components : int
         Clusters, and basis functions of each beside its mean.
@@ -76,7 +78,7 @@ class CompressionOptions:
         half, quantisation adds some percent to the error; see `Quantisation`.
     """
 
-    model: str = CLUSTERED
+    model: str = "auto"
     half_vector: HalfVectorOptions = field(default_factory=HalfVectorOptions)
     n_clusters: int = 8
     n_components: int = 6
@@ -89,9 +91,10 @@ class CompressionOptions:
     coarseness: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.model not in (CLUSTERED, HALF_VECTOR):
+        if self.model not in ("auto", CLUSTERED, HALF_VECTOR):
             raise InputError(
-                f"model: expected 'clustered' or 'half_vector', received {self.model!r}"
+                "model: expected 'auto', 'clustered' or 'half_vector', received "
+                f"{self.model!r}"
             )
         if self.fit not in ("auto", "samples", "grid"):
             raise InputError(

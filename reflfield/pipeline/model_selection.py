@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from reflfield.errors import InputError
-from reflfield.field.clustered_pca import MOST_SAMPLES
+from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR, MOST_SAMPLES
 from reflfield.pipeline.cache import StageFolder, plain
 from reflfield.pipeline.comparison import MAIN
 from reflfield.pipeline.context import AUTO, Job
@@ -26,6 +26,10 @@ OUTCOME = "choices.json"
 # that of the mean of four by half as much.
 CHANCE_DB = 1.0
 VISIBILITY, FIT = "resampling.visibility", "compression.fit"
+MODEL = "compression.model"
+# Samples of a texel, on average, that the half-vector model takes at least: below, frames and
+# colours of a texel are hardly determined.
+LEAST_HALF_VECTOR = 64
 
 
 @dataclass(frozen=True)
@@ -39,18 +43,20 @@ class Candidate:
         "auto" where it does not matter yet.
     name : str
         Of the choices that were open; empty where none was.
+    model : {"clustered", "half_vector"}
     """
 
     visibility: str
     fit: str
     name: str = ""
+    model: str = CLUSTERED
 
     def settled(self, options: PipelineOptions) -> PipelineOptions:
         """Options with these choices in place of "auto"."""
         return replace(
             options,
             resampling=replace(options.resampling, visibility=self.visibility),
-            compression=replace(options.compression, fit=self.fit),
+            compression=replace(options.compression, fit=self.fit, model=self.model),
         )
 
 
@@ -83,12 +89,32 @@ def candidates(job: Job) -> tuple[Candidate, ...]:
     tuple of Candidate
         One only, where nothing is open or nothing can be compared.
     """
-    pairs = [(shadows, fit) for shadows in _visibilities(job) for fit in _fits(job, shadows)]
+    models = {shadows: _model(job, shadows) for shadows in _visibilities(job)}
+    pairs = [(s, fit) for s, model in models.items() for fit in _fits(job, s, model)]
     varied = [len(set(values)) > 1 for values in zip(*pairs, strict=True)]
+    names = ["-".join(v for v, varies in zip(p, varied, strict=True) if varies) for p in pairs]
     return tuple(
-        Candidate(*pair, "-".join(v for v, varies in zip(pair, varied, strict=True) if varies))
-        for pair in pairs
+        Candidate(*pair, name, models[pair[0]])
+        for pair, name in zip(pairs, names, strict=True)
     )
+
+
+def _model(job: Job, visibility: str) -> str:
+    """The model asked for, or the one that the number of samples speaks for."""
+    asked = job.asked_options
+    if asked.compression.model != AUTO:
+        return asked.compression.model
+    wants_clusters = asked.comparison.without_alignment or asked.compression.fit != AUTO
+    if visibility == "kept" or not job.casts_shadows or wants_clusters:
+        return CLUSTERED
+    n = samples_per_texel(_settled_as(job, visibility))
+    return HALF_VECTOR if LEAST_HALF_VECTOR <= n <= MOST_SAMPLES else CLUSTERED
+
+
+def _settled_as(job: Job, visibility: str) -> Job:
+    """The job with shadows treated in a way, as far as its samples are concerned."""
+    options = Candidate(visibility, AUTO).settled(job.asked_options)
+    return replace(job, options=options)
 
 
 def _visibilities(job: Job) -> tuple[str, ...]:
@@ -98,7 +124,7 @@ def _visibilities(job: Job) -> tuple[str, ...]:
     return ("factored", "kept") if job.casts_shadows else ("kept",)
 
 
-def _fits(job: Job, visibility: str) -> tuple[str, ...]:
+def _fits(job: Job, visibility: str, model: str) -> tuple[str, ...]:
     """The fit that the number of samples speaks for, then the other if it is to be tried.
 
     The field on the grid is where the fit to the samples starts, and takes seconds. The fit
@@ -106,10 +132,9 @@ def _fits(job: Job, visibility: str) -> tuple[str, ...]:
     that those of enough texels would not fit in memory.
     """
     options = job.asked_options.compression
-    if options.fit != AUTO or not job.asked_options.aligns:
+    if options.fit != AUTO or model == HALF_VECTOR:
         return (options.fit,)
-    settled = Candidate(visibility, AUTO).settled(job.asked_options)
-    n = samples_per_texel(replace(job, options=settled))
+    n = samples_per_texel(_settled_as(job, visibility))
     found = ("samples", "grid") if options.fits_samples(n) else ("grid", "samples")
     compared = len(job.held_frames.photographs) > 0 and can_fit_samples(job, n)
     return found if compared else found[:1]
@@ -127,7 +152,9 @@ def samples_per_texel(job: Job) -> float:
 
 def first_affected(job: Job) -> str:
     """First stage whose result depends on what is open."""
-    return "indirect" if len(_visibilities(job)) > 1 else "compression"
+    if len(_visibilities(job)) > 1:
+        return "indirect"
+    return "surface" if job.asked_options.compression.model == AUTO else "compression"
 
 
 def is_open(job: Job) -> bool:
@@ -294,6 +321,13 @@ def words_of(job: Job) -> Iterator[str]:
     if asked.resampling.visibility == AUTO and options.resampling.visibility != AUTO:
         why = "no shadow could be traced" if not job.casts_shadows else _compared(job)
         yield f'{VISIBILITY} = "auto" took "{options.resampling.visibility}": {why}.'
+    if asked.compression.model == AUTO and options.compression.model == HALF_VECTOR:
+        n = samples_per_texel(job)
+        yield (
+            f'{MODEL} = "auto" took "{options.compression.model}": {n:.0f} samples per texel, '
+            f"the half-vector model takes {LEAST_HALF_VECTOR} to {MOST_SAMPLES} of a solid "
+            "object under known lights."
+        )
     if asked.compression.fit == AUTO and options.compression.fit != AUTO:
         compared = tried and len({c.fit for c in outcome(job).tried}) > 1
         why = _compared(job) if compared else _rule(job)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from reflfield.errors import InputError
-from reflfield.field.clustered_pca import CLUSTERED, CompressionOptions
+from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR, CompressionOptions
 from reflfield.geometry.occlusion import VisibilityOptions
 from reflfield.geometry.uv_atlas import LARGEST_TEXTURE, AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
@@ -187,7 +187,7 @@ class PipelineOptions:
     @property
     def aligns(self) -> bool:
         """Whether texels are completed and aligned: what a clustered field is made of."""
-        return self.compression.model == CLUSTERED
+        return self.compression.model != HALF_VECTOR
 
     @property
     def refines_surface(self) -> bool:
