@@ -413,7 +413,7 @@ def say_results(result: Any, started: float) -> None:
     """Time per stage, metrics, and where everything is."""
     for record in result.stages:
         state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
-        say(f"{record.name:<18}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
+        say(f"{record.name:<22}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
     for note in result.notes:
         say(note)
     if result.metrics:

@@ -14,8 +14,8 @@ from reflfield.capture.image_files import image_size
 from reflfield.capture.lights import DirectionalLight, Light
 from reflfield.errors import InputError
 from reflfield.options import Resources
-from reflfield.pipeline.compare_command import write_standalone_comparison
-from reflfield.pipeline.memory import check_frames_memory, check_picture_memory
+from reflfield.pipeline.compare_command import write_comparison_with
+from reflfield.pipeline.memory import check_frames_memory, check_image_memory
 from reflfield.pipeline.relight_command import write_relit_frames
 from reflfield.render.environment_map import EnvironmentMap
 from reflfield.render.renderer import RenderOptions
@@ -96,7 +96,7 @@ def compare(
     """
     limits = options or RenderOptions(), resources or Resources()
     fitting = check_frames_memory(field.stored, capture, *limits, compared=True)
-    return write_standalone_comparison(field.stored, capture, Path(out), fitting).to_dict()
+    return write_comparison_with(field.stored, capture, Path(out), fitting).to_dict()
 
 
 def render_turntable(
@@ -157,7 +157,7 @@ def render_turntable(
     x, y, z = stored.up.tolist()
     orbit = OrbitOptions(n_frames, (x, y, z), elevation_deg, size=size)
     width, height = (0, 0) if environment is None else image_size(environment)
-    fitting = check_picture_memory(
+    fitting = check_image_memory(
         stored,
         resources or Resources(),
         options or RenderOptions(),

@@ -21,9 +21,9 @@ from reflfield.options import (
     with_tables,
 )
 from reflfield.pipeline.cache import StageRecord
-from reflfield.pipeline.context import Job
-from reflfield.pipeline.hold_out import held_out_words, left_out_words
-from reflfield.pipeline.model_selection import words_of
+from reflfield.pipeline.context import Context
+from reflfield.pipeline.hold_out import held_out_sentence, left_out_sentences
+from reflfield.pipeline.model_selection import sentences
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.publishing import published
 from reflfield.pipeline.quantisation_search import missed_quality
@@ -117,27 +117,27 @@ def reconstruct(
         capture = open_capture(Path(capture).resolve(), test_split=held.test)
     if not isinstance(options, PipelineOptions):
         options = with_tables(PipelineOptions(), options or {})
-    job = run(
+    context = run(
         capture, folder, options, hold_out=held, resources=limits, first=from_stage, last=until
     )
-    return _result(job)
+    return _result(context)
 
 
-def _result(job: Job) -> Result:
-    compared = job.stages.record("comparison") is not None
+def _result(context: Context) -> Result:
+    compared = context.stages.record("comparison") is not None
     notes = (
-        f"held out: {held_out_words(job.split)}",
-        *left_out_words(job.capture, job.split),
-        *words_of(job),
-        *problems_of(job),
+        f"held out: {held_out_sentence(context.split)}",
+        *left_out_sentences(context.capture, context.split),
+        *sentences(context),
+        *problems_of(context),
     )
     return Result(
-        folder=job.out,
-        metrics=json.loads((job.out / "metrics.json").read_text()) if compared else {},
-        files=tuple(published(job)),
-        stages=tuple(job.stages.records),
+        folder=context.out,
+        metrics=json.loads((context.out / "metrics.json").read_text()) if compared else {},
+        files=tuple(published(context)),
+        stages=tuple(context.stages.records),
         notes=notes,
-        missed_quality=missed_quality(job),
+        missed_quality=missed_quality(context),
     )
 
 

@@ -17,7 +17,8 @@ from reflfield.alignment.model_fit import FitOptions, fit_model
 from reflfield.alignment.sample_sources import GriddedSamples, ScatteredSource
 from reflfield.observations.texel_reading import LUMINANCE, TexelReader
 from reflfield.observations.texel_samples import inverse_transform
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import results
+from reflfield.pipeline.context import Context
 from reflfield.sphere.harmonic_projection import safe_band_limit
 from reflfield.sphere.hemisphere import HemisphereGrid, softened_cosine
 from reflfield.util.blocks import Blocks
@@ -47,9 +48,9 @@ class AlignedFrames:
     free: Indices
 
 
-def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
+def write_alignment(context: Context, folder: Path) -> dict[str, Any]:
     """One local frame per texel."""
-    n = job.base_reader.n_texels
+    n = results.base_reader(context).n_texels
     frames = np.tile(np.eye(3), (n, 1, 1))
     arrays: dict[str, Any] = {
         "aligned": np.zeros(n, bool),
@@ -58,11 +59,11 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
         "margin": np.zeros(n),
         "history": np.zeros(0),
     }
-    keep = np.zeros(len(job.seen_texels), bool)
-    if job.options.alignment.enabled and max(job.sides) > 1:
-        entries = aligned(job, job.blocks(folder))
-        seen = job.seen_texels
-        keep = entries["margin"] >= job.options.alignment.least_margin
+    keep = np.zeros(len(results.measured_texels(context)), bool)
+    if context.options.alignment.enabled and max(context.grid_sides) > 1:
+        entries = aligned(context, context.blocks(folder))
+        seen = results.measured_texels(context)
+        keep = entries["margin"] >= context.options.alignment.least_margin
         arrays["aligned"][seen[keep]] = True
         frames[seen[keep]] = entries["local_from_base"][keep]
         for name in ("cluster", "score", "margin"):
@@ -73,31 +74,33 @@ def write_alignment(job: Job, folder: Path) -> dict[str, Any]:
     moved = np.degrees(np.arccos(np.clip(frames[:, 2, 2], -1, 1)))
     return {
         "texels aligned": n_aligned,
-        "texels that keep the base frame": len(job.seen_texels) - n_aligned,
-        "mean tilt from the base normal, degrees": float(moved[job.seen_texels].mean()),
+        "texels that keep the base frame": len(results.measured_texels(context)) - n_aligned,
+        "mean tilt from the base normal, degrees": float(
+            moved[results.measured_texels(context)].mean()
+        ),
         "rotation determined (margin > .01)": int((arrays["margin"] > 0.01).sum()),
     }
 
 
-def aligned_frames(job: Job) -> AlignedFrames:
+def aligned_frames(context: Context) -> AlignedFrames:
     """What the alignment has found."""
-    stored = job.result("alignment", "alignment.npz")
+    stored = results.arrays(context, "alignment", "alignment.npz")
     return AlignedFrames(stored["local_from_base"], np.flatnonzero(stored["aligned"]))
 
 
-def local_frames(job: Job, local_from_base: NDArray[np.float64]) -> Floats:
+def local_frames(context: Context, local_from_base: NDArray[np.float64]) -> Floats:
     """Frames of the texels in the world, from their turns against the base frames."""
-    return (local_from_base @ job.texels.local_from_world).astype(np.float32)
+    return (local_from_base @ results.texels(context).local_from_world).astype(np.float32)
 
 
-def aligned(job: Job, blocks: Blocks) -> dict[str, NDArray[Any]]:
+def aligned(context: Context, blocks: Blocks) -> dict[str, NDArray[Any]]:
     """Alignment of the texels that have samples: a model of all, then frames by blocks."""
-    seen, reader = job.seen_texels, job.base_reader
-    gridded = completed_luminance(job)
+    seen, reader = results.measured_texels(context), results.base_reader(context)
+    gridded = completed_luminance(context)
     raw: ScatteredSource = gridded
-    if job.options.alignment.refine:
-        raw = RawLuminance(reader, seen, job.resources.block_bytes)
-    options = fit_options(job, gridded)
+    if context.options.alignment.refine:
+        raw = RawLuminance(reader, seen, context.resources.block_bytes)
+    options = fit_options(context, gridded)
     model = blocks.once(
         "alignment model", lambda: arrays_of_model(fit_model(gridded, raw, options))
     )
@@ -129,9 +132,9 @@ def aligned_block(shared: Aligning, rows: Indices) -> dict[str, NDArray[Any]]:
     return {name: getattr(frames, name) for name in ENTRIES}
 
 
-def fit_options(job: Job, gridded: GriddedSamples) -> FitOptions:
+def fit_options(context: Context, gridded: GriddedSamples) -> FitOptions:
     """Options of the model, with band limits that the grids support."""
-    options = job.options.alignment
+    options = context.options.alignment
     spread = np.radians(options.spread_deg)
     limits = (_band_limit(options.band_limit, d) for d in (gridded.views, gridded.lights))
     return checked_options(
@@ -141,24 +144,24 @@ def fit_options(job: Job, gridded: GriddedSamples) -> FitOptions:
             iterations=options.iterations,
             n_clusters=options.n_clusters,
             refinement=replace(REFINEMENT, spread=spread) if options.refine else None,
-            seed=job.options.seed,
+            seed=context.options.seed,
             max_tilt=np.radians(options.max_tilt_deg),
-            n_threads=job.resources.workers,
+            n_threads=context.resources.workers,
         ),
     )
 
 
-def completed_luminance(job: Job) -> GriddedSamples:
+def completed_luminance(context: Context) -> GriddedSamples:
     """Completed texels that have samples, at the nodes of the grids."""
-    stored = job.result("completion", "completion.npz")
+    stored = results.arrays(context, "completion", "completion.npz")
     source = CompletedLuminance(
         mean=stored["mean"],
         basis=stored["basis"],
-        coefficients=stored["coefficients"][job.seen_texels],
-        sides=job.sides,
-        domain=job.options.resampling.domain,
+        coefficients=stored["coefficients"][results.measured_texels(context)],
+        sides=context.grid_sides,
+        domain=context.options.resampling.domain,
     )
-    view, light = (HemisphereGrid(side).directions for side in job.sides)
+    view, light = (HemisphereGrid(side).directions for side in context.grid_sides)
     return GriddedSamples.checked(source, view, light)
 
 

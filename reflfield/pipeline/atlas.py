@@ -13,8 +13,9 @@ from reflfield.errors import GeometryError
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.plane import image_plane
 from reflfield.geometry.uv_atlas import Atlas, built_atlas, fallback_words
+from reflfield.pipeline import results
 from reflfield.pipeline.cache import WARNINGS
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.pipeline_options import SMALLEST_TEXTURE
 
 # Among the counts of the atlas: who made the charts.
@@ -23,19 +24,20 @@ METHOD = "charts made by"
 TYPICAL_USE = 0.6
 
 
-def write_atlas(job: Job, folder: Path) -> dict[str, Any]:
+def write_atlas(context: Context, folder: Path) -> dict[str, Any]:
     """UV charts of the base surface, as fine as the photographs see it."""
-    if job.is_plane:
-        atlas, method = image_plane(job.training.cameras[0], job.view_silhouettes[0]), "plane"
+    if context.is_plane:
+        atlas = image_plane(context.training.cameras[0], results.silhouettes(context)[0])
+        method = "plane"
         warnings: list[str] = []
     else:
-        options = job.options.atlas
-        resolution = options.resolution or derived_resolution(job, job.hull_mesh)
-        built = built_atlas(job.hull_mesh, replace(options, resolution=resolution))
+        options = context.options.atlas
+        mesh = results.hull_mesh(context)
+        resolution = options.resolution or derived_resolution(context, mesh)
+        built = built_atlas(mesh, replace(options, resolution=resolution))
         atlas, method = built.atlas, built.method
         warnings = [fallback_words(built.reason)] if built.reason else []
     write_atlas_arrays(folder / "atlas.npz", atlas)
-    job.__dict__.pop("surface_atlas", None)
     return {
         "charts": int(atlas.chart.max()) + 1,
         "texture": [atlas.height, atlas.width],
@@ -68,11 +70,11 @@ def pixel_width(capture: Capture, mesh: Mesh) -> float:
     return float(np.median(footprints))
 
 
-def derived_resolution(job: Job, mesh: Mesh) -> int:
+def derived_resolution(context: Context, mesh: Mesh) -> int:
     """Side of a texture whose texels are a little finer than the cameras' pixels."""
-    texel = pixel_width(job.training, mesh) / job.options.texture.texels_per_pixel
+    texel = pixel_width(context.training, mesh) / context.options.texture.texels_per_pixel
     if not texel > 0:
         raise GeometryError("cameras: expected the object in front of most, found it behind")
     side = np.sqrt(mesh.area / TYPICAL_USE) / texel
-    side = np.clip(np.ceil(side / 16) * 16, SMALLEST_TEXTURE, job.options.texture.largest)
+    side = np.clip(np.ceil(side / 16) * 16, SMALLEST_TEXTURE, context.options.texture.largest)
     return int(side)

@@ -25,7 +25,7 @@ import platform
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -76,7 +76,7 @@ class StageRecord:
     reused : bool
         True if an earlier result was taken.
     cpu_seconds : float
-        Of the processor, all threads of this process together, which other programs on a
+        CPU time of all threads of this process together, which other programs on a
         busy machine change little.
     blocks_computed, blocks_resumed : int
         Blocks of work that this run has done, and that it found done by one that was
@@ -85,7 +85,7 @@ class StageRecord:
         Times that one of those done was begun again, because a cluster's worker had died at
         it or failed.
     work : dict of str to float
-        Processor seconds of each work by blocks; of work inside another, both.
+        CPU seconds of each work by blocks; of work inside another, both.
     """
 
     name: str
@@ -145,9 +145,9 @@ class StageFolder:
     ----------
     root : Path
         Folder that holds the stages' folders; created.
-    redo : set of str
+    redo : collection of str
         Stages to compute again even if their key matches.
-    also : sequence of StageFolder
+    others : sequence of StageFolder
         Where complete stages are taken over from; of those to compute again, only what has
         been run there meanwhile.
     """
@@ -155,15 +155,18 @@ class StageFolder:
     def __init__(
         self,
         root: Path,
-        redo: set[str] | None = None,
-        also: Sequence[StageFolder] = (),
+        redo: Collection[str] = (),
+        others: Sequence[StageFolder] = (),
     ) -> None:
-        root.mkdir(parents=True, exist_ok=True)
         self.root = root
-        self.redo = redo or set()
-        self.also = tuple(also)
+        self.redo = frozenset(redo)
+        self.others = tuple(others)
         self.records: list[StageRecord] = []
         self.tally = Tally()
+
+    def take_over_from(self, others: Iterable[StageFolder]) -> None:
+        """Take complete stages over from these folders from now on."""
+        self.others = tuple(others)
 
     def run(
         self,
@@ -203,6 +206,7 @@ class StageFolder:
         """
         inputs, after = dict(inputs or {}), dict(after or {})
         key = stage_key(name, options, {**inputs, **after}, code)
+        self.root.mkdir(parents=True, exist_ok=True)
         folder = self.root / name
         earlier = None if name in self.redo else _usable_record(folder, key, intact)
         if earlier is not None:
@@ -225,7 +229,7 @@ class StageFolder:
         self, name: str, key: str, partial: Path, intact: Callable[[Path], str]
     ) -> StageRecord | None:
         """The stage as another folder has it, linked into the unfinished one."""
-        for other in self.also:
+        for other in self.others:
             run = other.record(name)
             if name in self.redo and not run:
                 continue
@@ -304,13 +308,13 @@ def stage_key(name: str, options: Any, inputs: Mapping[str, str], code: str) -> 
 
 def versions() -> dict[str, str]:
     """Versions of this package and of what it computes with."""
-    found = {"reflfield": version("reflfield"), "python": platform.python_version()}
+    installed = {"reflfield": version("reflfield"), "python": platform.python_version()}
     for package in NUMERICAL_PACKAGES:
         try:
-            found[package] = version(package)
+            installed[package] = version(package)
         except ModuleNotFoundError:
             continue
-    return found
+    return installed
 
 
 def plain(value: Any) -> Any:

@@ -25,7 +25,7 @@ TOLD = {
 }
 
 
-def check_measured(capture: Capture, found: Projected) -> None:
+def check_measured(capture: Capture, projected: Projected) -> None:
     """Refuse photographs that say nothing of the object.
 
     Raises
@@ -33,14 +33,15 @@ def check_measured(capture: Capture, found: Projected) -> None:
     InputError
         If no value was measured, or all are 0.
     """
-    if not found.values.sum():
+    if not projected.values.sum():
         return
-    if found.count("measured") or found.count("black"):
-        if found.brightest <= 0.0:
+    if projected.count("measured") or projected.count("black"):
+        if projected.brightest <= 0.0:
             raise InputError(
                 f"{capture.name}: photographs: everything is dark: expected values above 0 "
-                f"where cameras see the object, received {int(found.values.sum())} that are "
-                "all 0; expose longer, and check lights, encoding and silhouettes"
+                "where cameras see the object, received "
+                f"{int(projected.values.sum())} that are all 0; "
+                "expose longer, and check lights, encoding and silhouettes"
             )
         return
     if not any(light.intensity.any() for light in capture.lights):
@@ -49,19 +50,21 @@ def check_measured(capture: Capture, found: Projected) -> None:
             f"{capture.n_lights} that are all 0; nothing can be learned from what dark lights "
             "show"
         )
-    parts = ", ".join(f"{found.count(k)} {k}" for k in VALUE_KINDS[1:] if found.count(k))
+    parts = ", ".join(
+        f"{projected.count(k)} {k}" for k in VALUE_KINDS[1:] if projected.count(k)
+    )
     raise InputError(
         f"{capture.name}: photographs: expected measured values where cameras see the object, "
-        f"received none of {int(found.values.sum())} ({parts}); expose shorter, and check "
+        f"received none of {int(projected.values.sum())} ({parts}); expose shorter, and check "
         "lights, alpha channels and silhouettes"
     )
 
 
-def clipping_lines(capture: Capture, found: Projected) -> Iterator[str]:
+def clipping_lines(capture: Capture, projected: Projected) -> Iterator[str]:
     """Say of what is more than a trace how much there is, and which camera has most."""
-    seen = np.maximum(found.values.sum(axis=1), 1)
+    seen = np.maximum(projected.values.sum(axis=1), 1)
     for kind, text in TOLD.items():
-        counts = found.values[:, VALUE_KINDS.index(kind)]
+        counts = projected.values[:, VALUE_KINDS.index(kind)]
         if counts.sum() > TRACE * seen.sum():
             worst = int(np.argmax(counts / seen))
             yield (

@@ -11,17 +11,17 @@ from reflfield.geometry.mesh import Mesh
 from reflfield.metrics.comparison_silhouettes import write_comparison_silhouettes
 from reflfield.metrics.held_out_photographs import RelitPairs, compare_with_photographs
 from reflfield.metrics.image_metrics import Comparison, metrics_text
-from reflfield.pipeline.relight_command import _pictures, check_kept
+from reflfield.pipeline.relight_command import check_kept, image_files
 from reflfield.render.renderer import RenderOptions
 from reflfield.report import sections
 from reflfield.report.page import ReportContent, write_report
 from reflfield.util.files import filling
 
 
-def write_standalone_comparison(
+def write_comparison_with(
     field: ReflectanceField, frames: Capture, out: Path, options: RenderOptions
 ) -> Comparison:
-    """Relight frames, measure them, and write pictures, ``metrics.json`` and a page.
+    """Relight frames, measure them, and write images, ``metrics.json`` and a page.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def write_standalone_comparison(
         If what the field shows is not finite.
     """
     pages = [out / "metrics.json", out / "report" / "index.html"]
-    check_kept(frames, [*pages, *_pictures(frames, out / "relit")])
+    check_kept(frames, [*pages, *image_files(frames, out / "relit")])
     with TemporaryDirectory() as scratch, filling(out) as partial:
         silhouettes = write_comparison_silhouettes(
             frames, frames, Mesh(field.positions, field.faces), Path(scratch), options.workers

@@ -11,9 +11,9 @@ from reflfield.field.file import open_field
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.held_out_photographs import RelitPairs, compare_with_photographs
 from reflfield.metrics.image_metrics import Comparison, NothingToMeasure, metrics_text
-from reflfield.pipeline.compared_photographs import frame_sets, truth_frames
-from reflfield.pipeline.context import Job
-from reflfield.pipeline.held_out_silhouettes import silhouettes_of_frames
+from reflfield.pipeline.compared_photographs import compared_photographs, unseen_photographs
+from reflfield.pipeline.context import Context
+from reflfield.pipeline.held_out_silhouettes import silhouettes_of
 from reflfield.pipeline.hold_out import held_out_counts
 from reflfield.pipeline.memory import within_memory
 
@@ -22,36 +22,36 @@ MAIN, WITHOUT = "field", "without_alignment"
 PROBLEMS = "problems"
 
 
-def write_comparison(job: Job, folder: Path) -> dict[str, Any]:
-    """Relight held-out frames and measure them; without any, say so."""
+def write_comparison(context: Context, folder: Path) -> dict[str, Any]:
+    """Relight held-out photographs and measure the images; without any, say so."""
     counts: dict[str, Any] = {}
-    problems = [problem for _, problem in [truth_frames(job)] if problem]
-    for variant, stage in variants(job).items():
-        field = open_field(job.stages.root / stage / "field.rfld")
-        measured, failed = _compare(job, field, folder / variant, variant)
+    problems = [problem for _, problem in [unseen_photographs(context)] if problem]
+    for variant, stage in variants(context).items():
+        field = open_field(context.stages.root / stage / "field.rfld")
+        measured, failed = _compare(context, field, folder / variant, variant)
         counts |= measured
         problems += failed if variant == MAIN else []
     compared = [folder / MAIN / f"{name}.json" for name in ("heldout", "truth")]
     main = next((json.loads(path.read_text()) for path in compared if path.is_file()), None)
     (folder / "metrics.json").write_text(
-        metrics_text(main, held_out=held_out_counts(job.split))
+        metrics_text(main, held_out=held_out_counts(context.split))
     )
-    n_frames = sum(len(f.photographs) for f in frame_sets(job).values())
+    n_frames = sum(len(f.photographs) for f in compared_photographs(context).values())
     return {"frames": n_frames, **counts, PROBLEMS: problems}
 
 
 def _compare(
-    job: Job, field: ReflectanceField, folder: Path, variant: str
+    context: Context, field: ReflectanceField, folder: Path, variant: str
 ) -> tuple[dict[str, float], list[str]]:
-    """Compare one field on all sets of frames; counts, and why a set was not compared."""
+    """Compare one field with all sets; counts, and why a set was not compared."""
     folder.mkdir(exist_ok=True)
-    options = within_memory(job.options.relighting, job.resources)
+    options = within_memory(context.options.relighting, context.resources)
     counts, problems = {}, []
-    for name, frames in frame_sets(job).items():
-        silhouettes = silhouettes_of_frames(job, name, frames)
+    for name, photographs in compared_photographs(context).items():
+        silhouettes = silhouettes_of(context, name, photographs)
         try:
             comparison = compare_with_photographs(
-                field, frames, silhouettes, folder / name, options
+                field, photographs, silhouettes, folder / name, options
             )
         except InputError as error:
             # Without the truth, or where nothing can be measured, the run goes on.
@@ -60,35 +60,35 @@ def _compare(
             problems.append(f"{name}: not compared: {error}")
             continue
         (folder / f"{name}.json").write_text(comparison.to_json())
-        words = f"{name} PSNR, dB" if variant == MAIN else f"{name} PSNR {variant}, dB"
-        counts[words.replace("_", " ")] = comparison.mean["psnr_ldr"]
+        count = f"{name} PSNR, dB" if variant == MAIN else f"{name} PSNR {variant}, dB"
+        counts[count.replace("_", " ")] = comparison.mean["psnr_ldr"]
     return counts, problems
 
 
-def variants(job: Job) -> dict[str, str]:
+def variants(context: Context) -> dict[str, str]:
     """Stage that makes the field of each variant that is compared."""
     stages = {MAIN: "compression"}
-    if job.options.compares_without_alignment:
+    if context.options.compares_without_alignment:
         stages[WITHOUT] = "without_alignment"
     return stages
 
 
-def relit_pairs(job: Job, variant: str = MAIN) -> dict[str, RelitPairs]:
+def relit_pairs(context: Context, variant: str = MAIN) -> dict[str, RelitPairs]:
     """What the comparison stage has relit and measured."""
-    root = job.stages.root / "comparison" / variant
+    root = context.stages.root / "comparison" / variant
     pairs = {}
-    for name, frames in frame_sets(job).items():
-        comparison = comparison_of(job, name, variant)
+    for name, photographs in compared_photographs(context).items():
+        comparison = comparison_of(context, name, variant)
         if comparison is not None:
-            silhouettes = silhouettes_of_frames(job, name, frames)
-            relit = RelitPairs(frames, root / name, silhouettes)
+            silhouettes = silhouettes_of(context, name, photographs)
+            relit = RelitPairs(photographs, root / name, silhouettes)
             pairs[name] = relit.measured_in(comparison)
     return pairs
 
 
-def comparison_of(job: Job, name: str, variant: str = MAIN) -> Comparison | None:
-    """Metrics of one set of frames that the comparison stage has measured."""
-    return read_comparison(job.stages.root / "comparison" / variant / f"{name}.json")
+def comparison_of(context: Context, name: str, variant: str = MAIN) -> Comparison | None:
+    """Metrics of one set of photographs that the comparison stage has measured."""
+    return read_comparison(context.stages.root / "comparison" / variant / f"{name}.json")
 
 
 def read_comparison(path: Path) -> Comparison | None:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from reflfield.factorization import Completion, complete
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.options import Resources
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import results
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import columns_at_once
-from reflfield.pipeline.texel_columns import Inference, Resampling, half_columns, inferred
+from reflfield.pipeline.texel_columns import Resampling, half_columns, inferred
 from reflfield.util.blocks import Blocks
 
 Floats = NDArray[np.float32]
@@ -25,29 +26,30 @@ Indices = NDArray[np.intp]
 COLUMNS_SHARE = 1 / 3
 
 
-def write_completion(job: Job, folder: Path) -> dict[str, Any]:
-    """Texels resampled in their base frames, and what was not observed of them filled."""
-    options = job.options.completion
-    chosen = job.training_texels(options.training_texels)
-    found, coefficients = completed(
-        job.base_reader,
+def write_completion(context: Context, folder: Path) -> dict[str, Any]:
+    """Resample texels in their base frames, and fill what was not observed of them."""
+    options = context.options.completion
+    chosen = results.random_texels(context, options.training_texels)
+    completion, coefficients = completed(
+        results.base_reader(context),
         chosen,
-        job.seen_texels,
+        results.measured_texels(context),
         rank=options.rank,
         passes=options.passes,
         method=options.method,
-        seed=job.options.seed,
-        resources=job.resources,
-        blocks=job.blocks(folder),
+        seed=context.options.seed,
+        resources=context.resources,
+        blocks=context.blocks(folder),
     )
-    write_completion_arrays(folder / "completion.npz", found, coefficients)
+    write_completion_arrays(folder / "completion.npz", completion, coefficients)
     return {
         "texels that shape the basis": len(chosen),
-        "texels completed": len(job.seen_texels),
-        "texels without samples": job.base_reader.n_texels - len(job.seen_texels),
-        "samples observed": job.observed.count(),
-        "share of nodes observed": float(found.coverage.mean()),
-        "residual": float(found.residuals[-1]),
+        "texels completed": len(results.measured_texels(context)),
+        "texels without samples": results.base_reader(context).n_texels
+        - len(results.measured_texels(context)),
+        "samples observed": results.observed(context).count(),
+        "share of nodes observed": float(completion.coverage.mean()),
+        "residual": float(completion.residuals[-1]),
     }
 
 
@@ -63,7 +65,7 @@ def completed(
     method: Literal["map", "brand"] = "map",
     seed: int = 0,
 ) -> tuple[Completion, Floats]:
-    """Completion shaped by the chosen texels, and coefficients of all.
+    """Return the completion shaped by the chosen texels, and coefficients of all.
 
     The columns of the chosen texels are kept in memory, or in a temporary folder where they
     are too many; the result depends on neither.
@@ -74,15 +76,19 @@ def completed(
     coefficients : (n_texels, rank) float32
         Zero (the mean) for texels without samples.
     """
-    context = Resampling(reader, resources.block_bytes)
+    resampling = Resampling(reader, resources.block_bytes)
 
     def basis() -> dict[str, NDArray[Any]]:
         blocks.folder.mkdir(exist_ok=True)
         with TemporaryDirectory(dir=blocks.folder, prefix="columns.") as folder:
             columns = half_columns(
-                blocks, context, chosen, int(resources.max_memory * COLUMNS_SHARE), Path(folder)
+                blocks,
+                resampling,
+                chosen,
+                int(resources.max_memory * COLUMNS_SHARE),
+                Path(folder),
             )
-            found = complete(
+            completion = complete(
                 columns,
                 rank=rank,
                 passes=passes,
@@ -90,27 +96,29 @@ def completed(
                 n_channels=3 // reader.weight_channels,
                 seed=seed,
             )
-        return arrays_of(found)
+        return arrays_of(completion)
 
-    found = completion_of(blocks.once("basis", basis))
-    coefficients = np.zeros((reader.n_texels, found.rank), np.float32)
-    coefficients[chosen] = found.coefficients
+    completion = completion_of(blocks.once("basis", basis))
+    coefficients = np.zeros((reader.n_texels, completion.rank), np.float32)
+    coefficients[chosen] = completion.coefficients
     others = np.setdiff1d(seen, chosen)
     if len(others):
         parts = blocks.map(
             "completing all texels",
             inferred,
-            Inference(found, context),
+            (completion, resampling),
             reader.blocks_of(others),
             at_once=columns_at_once(resources, reader.n_pairs),
         )
         coefficients[others] = parts.joined("coefficients")
-    return found, coefficients
+    return completion, coefficients
 
 
-def arrays_of(found: Completion) -> dict[str, NDArray[Any]]:
+def arrays_of(completion: Completion) -> dict[str, NDArray[Any]]:
     """Entries of a completion as arrays."""
-    return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+    return {
+        entry.name: np.asarray(getattr(completion, entry.name)) for entry in fields(completion)
+    }
 
 
 def completion_of(stored: dict[str, Any]) -> Completion:
@@ -123,13 +131,13 @@ def completion_of(stored: dict[str, Any]) -> Completion:
     return Completion(**{**stored, **numbers})
 
 
-def write_completion_arrays(path: Path, found: Completion, coefficients: Floats) -> None:
+def write_completion_arrays(path: Path, completion: Completion, coefficients: Floats) -> None:
     """Store what later stages need of a completion."""
     np.savez(
         path,
-        basis=found.basis.astype(np.float32),
-        mean=found.mean.astype(np.float32),
+        basis=completion.basis.astype(np.float32),
+        mean=completion.mean.astype(np.float32),
         coefficients=coefficients,
-        noise=np.array(found.noise),
-        residuals=np.array(found.residuals),
+        noise=np.array(completion.noise),
+        residuals=np.array(completion.residuals),
     )

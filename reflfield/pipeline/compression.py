@@ -13,10 +13,11 @@ from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.clustered_pca import HALF_VECTOR
 from reflfield.field.file import write_field
 from reflfield.metrics.sample_residual import sample_error
+from reflfield.pipeline import results
 from reflfield.pipeline.alignment import aligned_frames
 from reflfield.pipeline.cache import plain
 from reflfield.pipeline.completion import completion_of
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.half_vector_fit import write_half_vector_field
 from reflfield.pipeline.model_fitting import fitted_model
 from reflfield.pipeline.quantisation_search import FieldMaker
@@ -25,29 +26,29 @@ from reflfield.pipeline.resampling import ALL_COEFFICIENTS, Resampled
 Floats = NDArray[np.float32]
 
 
-def write_compression(job: Job, folder: Path) -> dict[str, Any]:
-    """Fit the model that was asked for -> field."""
-    if job.options.compression.model == HALF_VECTOR:
-        return write_half_vector_field(job, folder)
-    stored = job.result("resampling", "resampling.npz")
+def write_compression(context: Context, folder: Path) -> dict[str, Any]:
+    """Fit the model that the options name -> field."""
+    if context.options.compression.model == HALF_VECTOR:
+        return write_half_vector_field(context, folder)
+    stored = results.arrays(context, "resampling", "resampling.npz")
     coefficients = stored.pop(ALL_COEFFICIENTS)
-    found = Resampled(aligned_frames(job), completion_of(stored), coefficients)
-    maker = FieldMaker(job, job.options.compression, plain(job.options))
-    return write_compressed(found, maker, folder)
+    texels = Resampled(aligned_frames(context), completion_of(stored), coefficients)
+    maker = FieldMaker(context, context.options.compression, plain(context.options))
+    return write_compressed(texels, maker, folder)
 
 
-def write_compressed(found: Resampled, maker: FieldMaker, folder: Path) -> dict[str, Any]:
-    """Fit a field in the given frames, write it, and measure it on the samples."""
-    job = maker.job
-    model, reader = fitted_model(maker, found, job.blocks(folder))
+def write_compressed(texels: Resampled, maker: FieldMaker, folder: Path) -> dict[str, Any]:
+    """Fit a field in the frames of the texels, write it, and measure it on the samples."""
+    context = maker.context
+    model, reader = fitted_model(maker, texels, context.blocks(folder))
     made = maker.made(model, reader.local_from_world)
     write_field(folder / "field.rfld", made)
     write_model(folder / "model.npz", model, reader.local_from_world)
     size = (folder / "field.rfld").stat().st_size
-    raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
-    error = sample_error(made, job.base_reader, job.seen_texels)
-    n_fitted = len(job.seen_texels)
-    counted = reader.count_fitted(np.flatnonzero(job.sampled.any(axis=1)))
+    raw = int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 6
+    error = sample_error(made, results.base_reader(context), results.measured_texels(context))
+    n_fitted = len(results.measured_texels(context))
+    counted = reader.count_fitted(np.flatnonzero(results.sampled(context).any(axis=1)))
     return {
         "texels fitted": n_fitted,
         "texels that repeat another": made.n_texels - n_fitted,
@@ -74,9 +75,9 @@ def write_model(path: Path, model: ClusteredModel, frames: Floats) -> None:
     np.savez(path, local_from_world=frames, **arrays)
 
 
-def stored_model(job: Job, stage: str) -> tuple[ClusteredModel, NDArray[np.float32]]:
+def stored_model(context: Context, stage: str) -> tuple[ClusteredModel, NDArray[np.float32]]:
     """Model of a compression stage before it was quantised, and its frames."""
-    arrays: dict[str, Any] = job.result(stage, "model.npz")
+    arrays: dict[str, Any] = results.arrays(context, stage, "model.npz")
     frames = arrays.pop("local_from_world")
     residuals = tuple(arrays.pop("residuals").tolist())
     return ClusteredModel(**arrays, residuals=residuals), frames

@@ -46,8 +46,9 @@ from reflfield.fitting.texel_sample_fit import (
 from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.texel_reading import LUMINANCE
+from reflfield.pipeline import results
 from reflfield.pipeline.cache import plain
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.progress import report
@@ -79,87 +80,90 @@ class HalfVectorFit:
 
     Parameters
     ----------
-    job : Job
+    context : Context
     """
 
-    job: Job
+    context: Context
 
     @property
     def options(self) -> HalfVectorOptions:
         """Of the model."""
-        return self.job.options.compression.half_vector
+        return self.context.options.compression.half_vector
 
     @cached_property
     def graph(self) -> TexelGraph:
         """Neighbours of the texels."""
-        texels = self.job.texels
+        texels = results.texels(self.context)
         return texel_graph(texels.position, texels.normal)
 
     @cached_property
     def reliable(self) -> NDArray[np.bool_]:
         """(n_texels, n_lights) True where no shadow's edge passes within a texel."""
-        if self.job.visibility_kind == "kept":
-            return np.ones_like(self.job.light_seen)
-        return self.graph.all_around(self.job.light_seen)
+        if self.context.visibility_kind == "kept":
+            return np.ones_like(results.light_visible(self.context))
+        return self.graph.all_around(results.light_visible(self.context))
 
     @cached_property
     def white(self) -> float:
         """Sample that stands for white, 1/sr."""
-        job = self.job
-        seen = job.seen_texels
+        context = self.context
+        seen = results.measured_texels(context)
         n = min(len(seen), WHITE_TEXELS)
         chosen = seen[np.linspace(0, len(seen) - 1, n).astype(np.intp)]
-        values = [self._block(part, 1.0).values for part in job.base_reader.blocks_of(chosen)]
+        values = [
+            self._block(part, 1.0).values
+            for part in results.base_reader(context).blocks_of(chosen)
+        ]
         luminance = np.concatenate(values) @ LUMINANCE if values else np.zeros(0, np.float32)
         luminance = luminance[np.isfinite(luminance)]
         found = float(np.quantile(luminance, WHITE_QUANTILE)) if len(luminance) else 0.0
         return found if found > 0 else 1.0
 
     def _block(self, texels: Indices, white: float) -> SampleBlock:
-        found = self.job.base_reader.measured(texels)
+        found = results.base_reader(self.context).measured(texels)
         return sample_block(texels, found, self.reliable[texels], white)
 
     def blocks(self, texels: Indices) -> SampleBlocks:
         """Samples of some texels in units of white."""
-        parts = self.job.base_reader.blocks_of(texels)
-        budget = int(self.job.resources.max_memory * SAMPLES_SHARE)
+        parts = results.base_reader(self.context).blocks_of(texels)
+        budget = int(self.context.resources.max_memory * SAMPLES_SHARE)
         white = self.white
         return SampleBlocks(lambda n: self._block(parts[n], white), len(parts), budget)
 
     def to_samples(self) -> HalfVectorModel:
         """Model in units of white, fitted to the samples of the texels."""
-        job, n_lobes = self.job, self.options.n_lobes
-        with ThreadPoolExecutor(max(job.resources.workers, 1)) as pool:
-            blocks = self.blocks(job.seen_texels)
-            model = start_model(job.texels.local_from_world, n_lobes)
+        context, n_lobes = self.context, self.options.n_lobes
+        with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
+            blocks = self.blocks(results.measured_texels(context))
+            model = start_model(results.texels(context).local_from_world, n_lobes)
             model = with_start_colors(blocks, model, pool)
             rounds = ROUNDS if n_lobes == 1 else ROUNDS_OF_SEVERAL
-            some = self.blocks(job.training_texels(TRAINING_TEXELS))
+            some = self.blocks(results.random_texels(context, TRAINING_TEXELS))
             report("functions of the half vector", 0, 2 + TANGENT_ROUNDS)
             model, _ = fit_to_samples(
-                some, model, pool, rounds, self.options.smoothness, job.options.seed
+                some, model, pool, rounds, self.options.smoothness, context.options.seed
             )
             report("functions of the half vector", 1, 2 + TANGENT_ROUNDS)
             model, _ = solve_coefficients(blocks, model, pool)
-            rows = sample_rows(some, TABLE_ROWS, job.options.seed)
+            rows = sample_rows(some, TABLE_ROWS, context.options.seed)
             for i in range(TANGENT_ROUNDS):
                 model = with_tangents_along_highlights(blocks, model, self.graph, pool)
                 model = fit_tables(rows, model, pool, self.options.smoothness)
                 model, _ = solve_coefficients(blocks, model, pool)
                 report("functions of the half vector", 2 + i, 2 + TANGENT_ROUNDS)
-        return filled(model, job.texels.position, job.seen_texels)
+        return filled(model, results.texels(context).position, results.measured_texels(context))
 
     def to_photographs(self, model: HalfVectorModel, folder: Path) -> ImageFit:
         """Model in units of white, fitted to the photographs."""
-        job = self.job
+        context = self.context
         found = ImageFit(model, np.zeros(model.n_texels), 0.0)
         if not self.options.image_steps:
             return found
-        with ThreadPoolExecutor(max(job.resources.workers, 1)) as pool:
+        with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
             views = self.pixels(model, pool)
-            rows = pixel_rows(views, PIXEL_ROWS, job.options.seed)
+            rows = pixel_rows(views, PIXEL_ROWS, context.options.seed)
             allocate = self.allocator(views, folder)
-            normals = job.texels.normal.astype(np.float64)
+            normals = results.texels(context).normal.astype(np.float64)
             for i in range(self.options.image_steps):
                 report("fit to the photographs", i, self.options.image_steps)
                 found = image_step(views, model, self.graph, normals, pool, allocate)
@@ -170,21 +174,21 @@ class HalfVectorFit:
 
     def pixels(self, model: HalfVectorModel, pool: ThreadPoolExecutor) -> list[ViewPixels]:
         """Pixels of all views with the texels under them, as the field will be rendered."""
-        job = self.job
+        context = self.context
         surface = FieldSurface(self.build(model, 0.0))
 
         def one(view: int) -> ViewPixels:
-            camera = job.training.cameras[view]
-            usable = job.view_silhouettes[view] >= LEAST_COVERAGE
-            if not job.is_plane:
-                usable &= ~depth_edges(surface.scene, camera, job.options.visibility)
-            texels = job.texels
+            camera = context.training.cameras[view]
+            usable = results.silhouettes(context)[view] >= LEAST_COVERAGE
+            if not context.is_plane:
+                usable &= ~depth_edges(surface.scene, camera, context.options.visibility)
+            texels = results.texels(context)
             under = footprint_of(surface, camera, usable, texels.position, texels.normal)
             return view_pixels(
-                job.training, view, under, texels.position, self.reliable, self.white
+                context.training, view, under, texels.position, self.reliable, self.white
             )
 
-        return list(pool.map(one, range(job.training.n_views)))
+        return list(pool.map(one, range(context.training.n_views)))
 
     def allocator(
         self, views: Sequence[ViewPixels], folder: Path
@@ -192,32 +196,32 @@ class HalfVectorFit:
         """Maker of arrays for derivatives: in memory, or in files where they are too many."""
         shapes = [s for view in views for s in linearisation_shapes(view, self.options.n_lobes)]
         total = 4 * sum(int(np.prod(shape)) for shape in shapes)
-        if total <= self.job.resources.max_memory * DERIVATIVES_SHARE:
+        if total <= self.context.resources.max_memory * DERIVATIVES_SHARE:
             return lambda shape: np.zeros(shape, np.float32)
         return partial(array_in_file, folder)
 
     def build(self, model: HalfVectorModel, step: float) -> HalfVectorField:
         """Quantise a model in units of white on the base surface into a field."""
-        job, atlas = self.job, self.job.surface_atlas
+        context, atlas = self.context, results.atlas(self.context)
         surface = BaseSurface(
             positions=atlas.positions,
             faces=atlas.faces,
             uv=atlas.uv,
-            texel_of_pixel=job.texels.texel_of_pixel,
+            texel_of_pixel=results.texels(context).texel_of_pixel,
         )
         return build_half_vector_field(
             surface,
             in_samples(model, self.white),
-            job.indirect_light,
-            domain=job.options.resampling.domain,  # type: ignore[arg-type]
-            visibility=job.visibility_kind,  # type: ignore[arg-type]
-            metadata=field_metadata(job, plain(job.options)),
+            results.indirect_light(context),
+            domain=context.options.resampling.domain,  # type: ignore[arg-type]
+            visibility=context.visibility_kind,  # type: ignore[arg-type]
+            metadata=field_metadata(context, plain(context.options)),
             quantisation=Quantisation(step),
         )
 
     def made(self, model: HalfVectorModel) -> HalfVectorField:
         """Field of the size, the quality or the coarseness that was asked for."""
-        options = self.job.options.compression
+        options = self.context.options.compression
         step = self.step(options.coarseness)
 
         def build(at: float) -> HalfVectorField:
@@ -235,8 +239,13 @@ class HalfVectorFit:
 
     def quality(self, field: HalfVectorField) -> float:
         """LDR PSNR on the samples, dB."""
-        job = self.job
-        return sample_error(field, job.base_reader, job.seen_texels, SAMPLES_MEASURED).psnr_ldr
+        context = self.context
+        return sample_error(
+            field,
+            results.base_reader(context),
+            results.measured_texels(context),
+            SAMPLES_MEASURED,
+        ).psnr_ldr
 
 
 def array_in_file(folder: Path, shape: tuple[int, ...]) -> Floats:
@@ -265,7 +274,7 @@ def filled(
     return replace(model, diffuse=diffuse, weights=weights)
 
 
-def check_lights(job: Job) -> None:
+def check_lights(context: Context) -> None:
     """Demand known lights.
 
     Raises
@@ -273,7 +282,7 @@ def check_lights(job: Job) -> None:
     InputError
         If they are not.
     """
-    if not job.training.lights_known:
+    if not context.training.lights_known:
         raise InputError(
             "compression.model: 'half_vector' expected lights of known positions or "
             "directions, received unknown ones; take 'clustered'"
@@ -294,18 +303,18 @@ def write_model(path: Path, model: HalfVectorModel, white: float) -> None:
 
 def fitted_on_hull(fit: HalfVectorFit, folder: Path) -> ImageFit:
     """Fit from nothing: to the samples, then to the photographs."""
-    check_lights(fit.job)
-    blocks = fit.job.blocks(folder)
+    check_lights(fit.context)
+    blocks = fit.context.blocks(folder)
     stored = blocks.once("fit to the samples", lambda: arrays_of(fit.to_samples()))
     return _to_photographs(fit, HalfVectorModel(**stored), folder)
 
 
 def fitted_on_surface(fit: HalfVectorFit, folder: Path) -> ImageFit:
     """Fit that begins with that on the hull, with the normals of the new surface."""
-    stored: dict[str, Any] = fit.job.result("surface", MODEL)
+    stored: dict[str, Any] = results.arrays(fit.context, "surface", MODEL)
     white = float(stored.pop(WHITE))
     before = in_samples(HalfVectorModel(**stored), white / fit.white)
-    normals = fit.job.texels.normal.astype(np.float64)
+    normals = results.texels(fit.context).normal.astype(np.float64)
     frames = frames_with(normals, before.frames[:, 0])
     return _to_photographs(fit, replace(before, frames=frames), folder)
 
@@ -316,33 +325,35 @@ def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) ->
         extra = {"information": image_fit.information, "residual": np.array(image_fit.residual)}
         return arrays_of(image_fit.model) | extra
 
-    stored: dict[str, Any] = fit.job.blocks(folder).once("fit to the photographs", found)
+    stored: dict[str, Any] = fit.context.blocks(folder).once("fit to the photographs", found)
     information, residual = stored.pop("information"), float(stored.pop("residual"))
     return ImageFit(HalfVectorModel(**stored), information, residual)
 
 
-def stored_half_vector(job: Job) -> HalfVectorModel:
+def stored_half_vector(context: Context) -> HalfVectorModel:
     """Model of the stage "compression" before it was quantised, in units of white."""
-    stored: dict[str, Any] = job.result("compression", MODEL)
+    stored: dict[str, Any] = results.arrays(context, "compression", MODEL)
     del stored[WHITE]
     return HalfVectorModel(**stored)
 
 
-def write_half_vector_field(job: Job, folder: Path) -> dict[str, Any]:
+def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     """Fit a half-vector model, write its field, and measure it on the samples."""
-    job = job.refined
-    fit = HalfVectorFit(job)
-    found = (fitted_on_surface if job.on_surface else fitted_on_hull)(fit, folder)
+    context = context.refined
+    fit = HalfVectorFit(context)
+    found = (fitted_on_surface if context.on_surface else fitted_on_hull)(fit, folder)
     made = fit.made(found.model)
     write_field(folder / "field.rfld", made)
     write_model(folder / MODEL, found.model, fit.white)
     size = (folder / "field.rfld").stat().st_size
-    raw = int(np.prod(job.observed.views.shape)) * job.training.n_lights * 6
-    error = sample_error(made, job.base_reader, job.seen_texels)
-    counted = job.base_reader.count_fitted(np.flatnonzero(job.sampled.any(axis=1)))
+    raw = int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 6
+    error = sample_error(made, results.base_reader(context), results.measured_texels(context))
+    counted = results.base_reader(context).count_fitted(
+        np.flatnonzero(results.sampled(context).any(axis=1))
+    )
     return {
-        "texels fitted": len(job.seen_texels),
-        "texels that repeat another": made.n_texels - len(job.seen_texels),
+        "texels fitted": len(results.measured_texels(context)),
+        "texels that repeat another": made.n_texels - len(results.measured_texels(context)),
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         **made.counts,

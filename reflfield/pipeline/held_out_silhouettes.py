@@ -1,4 +1,4 @@
-"""Stage "frame_silhouettes": silhouettes of the photographs that fields are compared with."""
+"""Stage "held_out_silhouettes": silhouettes of the photographs to compare with."""
 
 from __future__ import annotations
 
@@ -11,35 +11,39 @@ from reflfield.metrics.comparison_silhouettes import (
     open_frame_silhouettes,
     write_comparison_silhouettes,
 )
-from reflfield.pipeline.compared_photographs import around, frame_sets
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import results
+from reflfield.pipeline.compared_photographs import compared_photographs, with_all_photographs
+from reflfield.pipeline.context import Context
 
-# Stage of the frames' silhouettes, and what a record says of what was left out.
-SILHOUETTES = "frame_silhouettes"
+STAGE = "held_out_silhouettes"
 
 
-def write_silhouettes_of_frames(job: Job, folder: Path) -> dict[str, Any]:
-    """Silhouettes of all views that are compared, once for all fields."""
+def write_held_out_silhouettes(context: Context, folder: Path) -> dict[str, Any]:
+    """Write the silhouettes of all views that are compared, once for all fields."""
     origins: list[str] = []
-    for name, frames in frame_sets(job).items():
+    for name, frames in compared_photographs(context).items():
         made = write_comparison_silhouettes(
-            frames, around(job, name), job.hull_mesh, folder / name, job.resources.workers
+            frames,
+            with_all_photographs(context, name),
+            results.hull_mesh(context),
+            folder / name,
+            context.resources.workers,
         )
         origins += made.origins
     return {"views": len(origins), **{o: origins.count(o) for o in sorted(set(origins))}}
 
 
-def silhouettes_digests(job: Job) -> dict[str, str]:
+def silhouettes_digests(context: Context) -> dict[str, str]:
     """Digests of what the silhouettes of the frames are made from."""
     digests = {}
-    for name, frames in frame_sets(job).items():
-        whole = around(job, name)
+    for name, frames in compared_photographs(context).items():
+        whole = with_all_photographs(context, name)
         ids = {camera.id for camera in frames.cameras}
         views = [i for i, camera in enumerate(whole.cameras) if camera.id in ids]
-        digests[name] = job.digest_of(whole.subset(views), "cameras", "silhouettes")
+        digests[name] = context.digest_of(whole.subset(views), "cameras", "silhouettes")
     return digests
 
 
-def silhouettes_of_frames(job: Job, name: str, frames: Capture) -> ComparisonSilhouettes:
+def silhouettes_of(context: Context, name: str, frames: Capture) -> ComparisonSilhouettes:
     """Silhouettes of a set of frames, as their stage has made them."""
-    return open_frame_silhouettes(job.stages.root / SILHOUETTES / name, frames)
+    return open_frame_silhouettes(context.stages.root / STAGE / name, frames)

@@ -16,7 +16,7 @@ from reflfield.options import HoldOut
 Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
-# Of views or lights with many photographs, so many are compared: more say nothing new.
+# Of views or lights with many photographs, so many are compared: more are redundant.
 MOST_COMPARED = 64
 # Steps of this share of the lights leave the most even gaps, however many there are.
 GOLDEN_SHARE = (5**0.5 - 1) / 2
@@ -234,17 +234,17 @@ def evenly_spread(count: int, total: int, what: str) -> Indices:
     return ((np.arange(count) + 0.5) * total / max(count, 1)).astype(np.intp)
 
 
-# --- words --------------------------------------------------------------------------------
+# --- sentences ----------------------------------------------------------------------------
 
 
-def held_out_words(split: Split) -> str:
+def held_out_sentence(split: Split) -> str:
     """One sentence on which photographs are compared and how many make the field.
 
     Examples
     --------
     >>> one, none = np.array([3]), np.zeros(0, int)
     >>> split = Split(none, none, none, none, np.arange(9), one, none, CHOSEN)
-    >>> held_out_words(split)
+    >>> held_out_sentence(split)
     '1 photograph, spread over views and lights, is compared; 9 of 10 make the field'
     """
     n = len(split.trained)
@@ -280,7 +280,7 @@ def _which(split: Split) -> str:
     }[split.kind]
 
 
-def left_out_words(capture: Capture, split: Split) -> Iterator[str]:
+def left_out_sentences(capture: Capture, split: Split) -> Iterator[str]:
     """One sentence for each kind of camera or light that has no photograph, or none left.
 
     Parameters

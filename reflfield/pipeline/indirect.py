@@ -1,8 +1,9 @@
-"""Stage that finds what texels show where no light reaches them directly."""
+"""Stage "indirect": what texels show where no light reaches them directly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,72 +14,38 @@ from scipy.spatial import cKDTree
 
 from reflfield.field.indirect_fit import fit_indirect
 from reflfield.observations.texel_reading import Shade, TexelReader
+from reflfield.pipeline import results
 from reflfield.pipeline.atlas import pixel_width
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 
 # Texels so near to one that the light reaches, in texel spacings and not less than a pixel, are
 # at the edge of a shadow: their pixels mix both.
 EDGE_SPACINGS = 1.5
 
 
-@dataclass(frozen=True, eq=False)
-class Shading:
-    """What all blocks share whose shade is read.
-
-    Parameters
-    ----------
-    reader : TexelReader
-    at_edge : (n_texels, n_lights) bool
-        True where the light reaches the texel's surroundings.
-    """
-
-    reader: TexelReader
-    at_edge: NDArray[np.bool_]
-
-
-def shade_block(context: Shading, texels: NDArray[np.intp]) -> dict[str, Any]:
-    """Shade of some texels, one sample for each light."""
-    found = context.reader.shade(texels)
-    # Views agree but for noise, the model errs more: one sample, however many there are.
-    inside = ~context.at_edge[texels]
-    used = (found.weights > 0) & inside[..., None]
-    # Of views that have measured any channel.
-    n_views = found.weights.max(axis=2)
-    return {
-        "values": (found.values / np.float32(context.reader.domain_unit)).astype(np.float16),
-        "weights": used.astype(np.float32),
-        "lights": found.lights,
-        "samples": np.array(n_views.sum(dtype=np.float64)),
-        "used": np.array((n_views * inside).sum(dtype=np.float64)),
-    }
-
-
-def write_indirect(job: Job, folder: Path) -> dict[str, Any]:
-    """Indirect light of all texels that a camera sees."""
-    options, reader, seen = job.options.indirect, job.base_reader, job.texels_in_view
-    radius = max(EDGE_SPACINGS * job.texels.spacing, pixel_width(job.training, job.hull_mesh))
-    at_edge = neighbourhood_reached(job.texels.position, job.light_seen, radius)
-    parts = job.blocks(folder).map(
-        "light in the shadows", shade_block, Shading(reader, at_edge), reader.blocks_of(seen)
+def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
+    """Write the indirect light of all texels that a camera sees."""
+    options, reader = context.options.indirect, results.base_reader(context)
+    in_view = results.texels_in_view(context)
+    parts = context.blocks(folder).map(
+        "light in the shadows",
+        shade_block,
+        (reader, texels_at_edge(context)),
+        reader.blocks_of(in_view),
     )
     shade = Shade(*(parts.joined(name) for name in ("values", "weights", "lights")))
     n_samples, n_used = (
         sum(float(part[name]) for part in parts) for name in ("samples", "used")
     )
     in_shade = np.flatnonzero(shade.weights.any(axis=(1, 2)))
-    rng = np.random.default_rng(job.options.seed)
+    rng = np.random.default_rng(context.options.seed)
     n = min(len(in_shade), options.training_texels)
-    chosen = np.sort(rng.choice(in_shade, n, replace=False))
-
-    def read(texels: NDArray[np.intp]) -> Shade:
-        values = shade.values[texels].astype(np.float32) * np.float32(reader.domain_unit)
-        arrays = (values, shade.weights[texels], shade.lights[texels])
-        return replace(shade, **dict(zip(("values", "weights", "lights"), arrays, strict=True)))
-
-    model = fit_indirect(read, chosen, job.training.n_lights, options.n_components)
+    training = np.sort(rng.choice(in_shade, n, replace=False))
+    read = partial(shade_rows, shade, reader.domain_unit)
+    model = fit_indirect(read, training, context.training.n_lights, options.n_components)
     coefficients = np.zeros((reader.n_texels, len(model.variances)), np.float32)
-    for some in np.array_split(np.arange(len(seen)), max(1, len(seen) // 1024)):
-        coefficients[seen[some]] = model.coefficients(read(some))
+    for rows in np.array_split(np.arange(len(in_view)), max(1, len(in_view) // 1024)):
+        coefficients[in_view[rows]] = model.coefficients(read(rows))
     np.savez(folder / "indirect.npz", functions=model.functions(), coefficients=coefficients)
     return {
         "samples in shadow": int(n_samples),
@@ -86,6 +53,47 @@ def write_indirect(job: Job, folder: Path) -> dict[str, Any]:
         "texels that show shadow": len(in_shade),
         "components": len(model.variances),
         "residual in the domain": float(np.sqrt(model.noise)),
+    }
+
+
+def texels_at_edge(context: Context) -> NDArray[np.bool_]:
+    """(n_texels, n_lights) True where the light reaches the texel or its surroundings."""
+    texels = results.texels(context)
+    pixel = pixel_width(context.training, results.hull_mesh(context))
+    radius = max(EDGE_SPACINGS * texels.spacing, pixel)
+    return neighbourhood_reached(texels.position, results.light_visible(context), radius)
+
+
+def shade_rows(shade: Shade, unit: float, rows: NDArray[np.intp]) -> Shade:
+    """Return some rows of a shade whose values are halves in a unit."""
+    values = shade.values[rows].astype(np.float32) * np.float32(unit)
+    return replace(shade, values=values, weights=shade.weights[rows], lights=shade.lights[rows])
+
+
+def shade_block(
+    shared: tuple[TexelReader, NDArray[np.bool_]], texels: NDArray[np.intp]
+) -> dict[str, Any]:
+    """Return the shade of some texels, one sample for each light.
+
+    Parameters
+    ----------
+    shared : (TexelReader, (n_texels, n_lights) bool)
+        Reader of the base frames, and True where the light reaches the texel's surroundings.
+    texels : (n,) int
+    """
+    reader, at_edge = shared
+    shade = reader.shade(texels)
+    # Views agree but for noise, the model errs more: one sample, however many there are.
+    inside = ~at_edge[texels]
+    used = (shade.weights > 0) & inside[..., None]
+    # Of views that have measured any channel.
+    n_views = shade.weights.max(axis=2)
+    return {
+        "values": (shade.values / np.float32(reader.domain_unit)).astype(np.float16),
+        "weights": used.astype(np.float32),
+        "lights": shade.lights,
+        "samples": np.array(n_views.sum(dtype=np.float64)),
+        "used": np.array((n_views * inside).sum(dtype=np.float64)),
     }
 
 

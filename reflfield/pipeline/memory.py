@@ -16,7 +16,8 @@ from reflfield.observations.store import (
     chunk_shape,
 )
 from reflfield.options import Resources, gigabytes
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import results
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.texel_columns import COLUMNS_AT_ONCE
 from reflfield.render.renderer import RenderOptions
 
@@ -28,7 +29,7 @@ PHOTOGRAPH_BYTES = 48
 # A pixel of a held-out photograph while it is compared and shown in the report; and of the
 # strip that is measured, besides.
 HELD_OUT_BYTES, STRIP_BYTES = 46, 500
-# What compiling the kernels of a first run leaves in memory, before frames are compared.
+# What compiling the kernels of a first run leaves in memory, before photographs are compared.
 COMPILED_BYTES = 400 << 20
 # A pixel of a silhouette while it is made from photographs.
 SILHOUETTE_BYTES = 80
@@ -44,7 +45,7 @@ WRITER_COPIES = 2
 LARGEST_USE = 0.8
 
 
-def least_memory(job: Job) -> int:
+def least_memory(context: Context) -> int:
     """Bytes that the run holds at the same time however small its blocks are.
 
     Of every view which of its pixels are covered, what is made of the largest image, and the
@@ -52,21 +53,21 @@ def least_memory(job: Job) -> int:
     view under all lights, and one block of each thread or the columns of one: whichever is
     more.
     """
-    training = job.training
+    training = context.training
     pixels = [camera.width * camera.height for camera in training.cameras]
-    held = [camera.width * camera.height for camera in job.held_frames.cameras]
+    held = [camera.width * camera.height for camera in context.held_out.cameras]
     made = any(path is None for path in training.silhouettes)
     largest = max(
         max(PHOTOGRAPH_BYTES, SILHOUETTE_BYTES * made) * max(pixels),
         compared_bytes(max(held, default=0)),
     )
-    texels, n_lights = most_texels(job), training.n_lights
+    texels, n_lights = most_texels(context), training.n_lights
     samples = min(WRITER_BYTES, VIEWS_PER_CHUNK * texels * n_lights * SAMPLE_BYTES)
     images = sum(pixels) // 8 + largest + texels * TEXEL_BYTES + WRITER_COPIES * samples
-    rank = max(job.options.completion.rank, job.options.compression.rank)
+    rank = max(context.options.completion.rank, context.options.compression.rank)
     each = TEXEL_BYTES + training.n_views + 7 * training.n_lights + 12 * rank
-    blocks = job.resources.workers * job.resources.block_bytes
-    columns = columns_bytes(job.sides[0] ** 2 * job.sides[1] ** 2)
+    blocks = context.resources.workers * context.resources.block_bytes
+    columns = columns_bytes(context.grid_sides[0] ** 2 * context.grid_sides[1] ** 2)
     return BASE_BYTES + max(images, texels * each + max(blocks, columns))
 
 
@@ -82,28 +83,28 @@ def compared_bytes(pixels: int) -> int:
     return HELD_OUT_BYTES * pixels + strip + COMPILED_BYTES if pixels else 0
 
 
-def keeps_distances(job: Job) -> bool:
+def keeps_distances(context: Context) -> bool:
     """Whether the distances to the outlines of all views may stay in memory."""
-    pixels = sum(camera.width * camera.height for camera in job.training.cameras)
-    return DISTANCE_BYTES * pixels <= job.resources.max_memory // 8
+    pixels = sum(camera.width * camera.height for camera in context.training.cameras)
+    return DISTANCE_BYTES * pixels <= context.resources.max_memory // 8
 
 
-def silhouettes_at_once(job: Job) -> int:
+def silhouettes_at_once(context: Context) -> int:
     """Threads that may each make a silhouette at a time."""
-    most = max(camera.width * camera.height for camera in job.training.cameras)
-    return int(max(1, (job.resources.max_memory - BASE_BYTES) // (SILHOUETTE_BYTES * most)))
+    most = max(camera.width * camera.height for camera in context.training.cameras)
+    return int(max(1, (context.resources.max_memory - BASE_BYTES) // (SILHOUETTE_BYTES * most)))
 
 
-def most_texels(job: Job) -> int:
+def most_texels(context: Context) -> int:
     """Upper bound on the texels of the run, known before there is a surface."""
-    if job.is_plane:
-        camera = job.capture.cameras[0]
+    if context.is_plane:
+        camera = context.capture.cameras[0]
         return camera.width * camera.height
-    side = job.options.atlas.resolution or job.options.texture.largest
+    side = context.options.atlas.resolution or context.options.texture.largest
     return int(LARGEST_USE * side**2)
 
 
-def check_memory(job: Job) -> None:
+def check_memory(context: Context) -> None:
     """Refuse a ceiling that cannot be met.
 
     Raises
@@ -111,12 +112,12 @@ def check_memory(job: Job) -> None:
     InputError
         Naming what would suffice.
     """
-    least, given = least_memory(job), job.resources.max_memory
-    if least > given:
+    least, allowed = least_memory(context), context.resources.max_memory
+    if least > allowed:
         raise InputError(
             f"max_memory: expected at least {gigabytes(least + (1 << 26))} for "
-            f"{job.training.n_views} views, {job.training.n_lights} lights and up to "
-            f"{most_texels(job)} texels, received {gigabytes(given)}; raise it, or lower "
+            f"{context.training.n_views} views, {context.training.n_lights} lights and up to "
+            f"{most_texels(context)} texels, received {gigabytes(allowed)}; raise it, or lower "
             "texture.largest"
         )
 
@@ -131,22 +132,26 @@ def columns_at_once(resources: Resources, n_pairs: int) -> int:
     return int(max(1, (resources.max_memory - BASE_BYTES) // (2 * columns_bytes(n_pairs))))
 
 
-def writers_at_once(job: Job) -> int:
+def writers_at_once(context: Context) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
-    n_texels, n_views, n_lights = (len(job.texels), job.training.n_views, job.training.n_lights)
+    n_texels, n_views, n_lights = (
+        len(results.texels(context)),
+        context.training.n_views,
+        context.training.n_lights,
+    )
     views = chunk_shape(n_texels, n_views, n_lights)[1]
     samples = views * n_texels * n_lights * SAMPLE_BYTES
-    pixels = max(camera.width * camera.height for camera in job.training.cameras)
-    photographs = max(WRITER_COPIES * job.resources.block_bytes, PHOTOGRAPH_BYTES * pixels)
-    free = job.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES
+    pixels = max(camera.width * camera.height for camera in context.training.cameras)
+    photographs = max(WRITER_COPIES * context.resources.block_bytes, PHOTOGRAPH_BYTES * pixels)
+    free = context.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES
     return int(max(1, free // (WRITER_COPIES * samples + photographs)))
 
 
-# --- pictures outside of a run -------------------------------------------------------------
+# --- images outside of a run ---------------------------------------------------------------
 
-# A pixel of a picture while it is rendered and written: radiance, coverage, both, a copy.
-PICTURE_BYTES = 64
-# A pixel of a photograph beside it: as stored, linear, what of it is measured; the picture
+# A pixel of an image while it is rendered and written: radiance, coverage, both, a copy.
+IMAGE_BYTES = 64
+# A pixel of a photograph beside it: as stored, linear, what of it is measured; the image
 # read again, silhouette and masks.
 COMPARED_BYTES = 96
 # A pixel of a turntable's frame, all of which are kept: half floats, encoded, animated.
@@ -158,7 +163,7 @@ RENDERED_TEXEL_BYTES = 160
 
 
 def field_bytes(field: ReflectanceField, n_directions: int) -> int:
-    """Memory of a field, decoded for pictures, with its shadows under so many directions."""
+    """Memory of a field, decoded for rendering, with its shadows under so many directions."""
     shapes = {name: array.shape for name, array in field.arrays.items()}
     n_clusters, n_functions, _ = shapes["function_factor"]
     nodes = shapes["view_factor"][0] * shapes["light_factor"][0]
@@ -167,17 +172,17 @@ def field_bytes(field: ReflectanceField, n_directions: int) -> int:
     return 2 * 12 * n_clusters * nodes * n_functions + shapes["cluster"][0] * texel
 
 
-def check_picture_memory(
+def check_image_memory(
     field: ReflectanceField,
     resources: Resources,
     options: RenderOptions,
     *,
     pixels: int,
-    pixel_bytes: int = PICTURE_BYTES,
+    pixel_bytes: int = IMAGE_BYTES,
     kept_pixels: int = 0,
     map_pixels: int = 0,
 ) -> RenderOptions:
-    """Options with which pictures stay below a ceiling of memory; they look the same.
+    """Return options with which images stay below a ceiling of memory; they look the same.
 
     Parameters
     ----------
@@ -185,7 +190,7 @@ def check_picture_memory(
     resources : Resources
     options : RenderOptions
     pixels : int
-        Of the largest picture.
+        Of the largest image.
     pixel_bytes : int
         Memory of one of them.
     kept_pixels : int
@@ -205,16 +210,16 @@ def check_picture_memory(
     """
     fitting = within_memory(options, resources)
     blocks = fitting.workers * fitting.block_pixels * RAY_BYTES * options.samples_per_pixel
-    pictures = pixels * pixel_bytes + kept_pixels * FRAME_BYTES
+    images = pixels * pixel_bytes + kept_pixels * FRAME_BYTES
     directions = options.environment_directions if map_pixels else 0
     least = BASE_BYTES + field_bytes(field, directions) + map_pixels * MAP_BYTES
-    least += blocks + pictures
+    least += blocks + images
     if least > resources.max_memory:
         frames = f" and {kept_pixels} in all" if kept_pixels else ""
         received = gigabytes(resources.max_memory)
         raise InputError(
-            f"max_memory: expected at least {gigabytes(least + (1 << 26))} for pictures of "
-            f"{pixels} pixels{frames}, received {received}; raise it, or make the pictures, "
+            f"max_memory: expected at least {gigabytes(least + (1 << 26))} for images of "
+            f"{pixels} pixels{frames}, received {received}; raise it, or make the images, "
             "their number or the map smaller"
         )
     return fitting
@@ -228,15 +233,15 @@ def check_frames_memory(
     *,
     compared: bool = False,
 ) -> RenderOptions:
-    """`check_picture_memory` of the largest frame and map of some frames."""
+    """`check_image_memory` of the largest frame and map of some frames."""
     maps = [s.file for light in frames.lights for s in light.sources if s.file is not None]
     sizes = [image_size(path) for path in maps]
-    return check_picture_memory(
+    return check_image_memory(
         field,
         resources,
         options,
         pixels=max((c.width * c.height for c in frames.cameras), default=0),
-        pixel_bytes=PICTURE_BYTES + compared * COMPARED_BYTES,
+        pixel_bytes=IMAGE_BYTES + compared * COMPARED_BYTES,
         map_pixels=max((width * height for width, height in sizes), default=0),
     )
 
@@ -246,7 +251,7 @@ RAY_BYTES = 4096
 
 
 def within_memory(options: RenderOptions, resources: Resources) -> RenderOptions:
-    """Blocks of pixels that all threads together can work on; the pictures stay the same."""
+    """Blocks of pixels that all threads together can work on; the images stay the same."""
     each = RAY_BYTES * options.samples_per_pixel
     workers = options.workers or resources.workers
     fits = max(4 * resources.block_bytes // (workers * each), 64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,9 @@ from reflfield.field.coefficients import solve_coefficients
 from reflfield.field.frame_refinement import refined_frames
 from reflfield.field.sample_fit import SampleFitOptions, fit_basis
 from reflfield.observations.texel_reading import TexelReader
+from reflfield.pipeline import results
 from reflfield.pipeline.alignment import local_frames
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.pipeline.resampling import Resampled
 from reflfield.util.blocks import Blocks
@@ -40,13 +42,16 @@ TEXELS_FOR_NOISE = 512
 
 
 def fitted_model(
-    maker: FieldMaker, found: Resampled, blocks: Blocks
+    maker: FieldMaker, resampled: Resampled, blocks: Blocks
 ) -> tuple[ClusteredModel, TexelReader]:
-    """Clusters, mean, basis and coefficients, and the reader of the frames they stand in."""
-    job = maker.job
-    reader = job.base_reader.rotated(local_frames(job, found.frames.local_from_base))
-    model, reader = _chosen_fit(_Fitting(job, found, reader, blocks), maker)
-    return fill_unobserved(model, job.texels.position, job.seen_texels), reader
+    """Return clusters, mean, basis and coefficients, and the reader of their frames."""
+    context = maker.context
+    reader = results.base_reader(context).rotated(
+        local_frames(context, resampled.frames.local_from_base)
+    )
+    model, reader = _selected_fit(_Fitting(context, resampled, reader, blocks), maker)
+    positions, measured = results.texels(context).position, results.measured_texels(context)
+    return fill_unobserved(model, positions, measured), reader
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,33 +60,35 @@ class _Fitting:
 
     Parameters
     ----------
-    job : Job
-    found : Resampled
+    context : Context
+    resampled : Resampled
     reader : TexelReader
         In its frames.
     blocks : Blocks
     """
 
-    job: Job
-    found: Resampled
+    context: Context
+    resampled: Resampled
     reader: TexelReader
     blocks: Blocks
 
     def on_grid(self, options: CompressionOptions) -> ClusteredModel:
         """Model of the resampled columns."""
         return cluster_completed(
-            self.found.completion,
-            self.found.coefficients,
-            self.job.seen_texels,
+            self.resampled.completion,
+            self.resampled.coefficients,
+            results.measured_texels(self.context),
             (self.reader.sides[0] ** 2, self.reader.sides[1] ** 2),
             options,
-            self.job.options.seed,
+            self.context.options.seed,
         )
 
     def fits_samples(self, options: CompressionOptions) -> bool:
         """Whether the model is then fitted to the samples."""
-        job = self.job
-        return options.fits_samples(job.observed.count() / len(job.seen_texels))
+        context = self.context
+        return options.fits_samples(
+            results.observed(context).count() / len(results.measured_texels(context))
+        )
 
     def fitted(
         self, options: CompressionOptions, name: str = ""
@@ -89,122 +96,125 @@ class _Fitting:
         """Model, and the reader in frames that were improved on the way; `name` is its own."""
         model = self.on_grid(options)
         if not self.fits_samples(options):
-            return _within_bounds(self.job, model, self.reader, self.blocks, name), self.reader
-        free = self.found.frames.free
+            bounded = _within_bounds(self.context, model, self.reader, self.blocks, name)
+            return bounded, self.reader
+        aligned = self.resampled.frames.free
         model = of_usual_size(model)
-        return _fitted_to_samples(self.job, model, self.reader, free, self.blocks, name)
+        return _fitted_to_samples(self.context, model, self.reader, aligned, self.blocks, name)
 
 
-def _chosen_fit(fitting: _Fitting, maker: FieldMaker) -> tuple[ClusteredModel, TexelReader]:
-    """Model with the clusters and components asked for, or that a size or quality needs."""
+def _selected_fit(fitting: _Fitting, maker: FieldMaker) -> tuple[ClusteredModel, TexelReader]:
+    """Return the model of the clusters and components that the options or the search name."""
     options = maker.options
     if not maker.searches:
         return fitting.fitted(options)
     frames = fitting.reader.local_from_world
     if not (options.psnr and fitting.fits_samples(options)):
         return fitting.fitted(maker.ranked(fitting.on_grid, frames, 0.0)[0])
-    # What the fit to the samples brings is measured once. The least that then promises to
-    # reach the quality is tried first, and the smallest field of those that do is taken.
+    # What the fit to the samples gains is measured once. Candidates are fitted in the order of
+    # their expected sizes until one reaches the quality; the smallest field that does is used.
     usual = fitting.fitted(options, " for the quality")
-    reached = maker.quality_of(*usual)
-    tried = [(reached, usual)]
-    gain = reached - maker.quality_of(fitting.on_grid(options), fitting.reader)
-    for choice in maker.ranked(fitting.on_grid, frames, gain):
-        name = f" for the quality, {choice.n_clusters} x {choice.n_components}"
-        found = fitting.fitted(choice, name)
-        tried.append((maker.quality_of(*found), found))
-        if tried[-1][0] >= options.psnr:
+    quality = maker.quality_of(*usual)
+    fits = [(quality, usual)]
+    gain = quality - maker.quality_of(fitting.on_grid(options), fitting.reader)
+    for candidate in maker.ranked(fitting.on_grid, frames, gain):
+        name = f" for the quality, {candidate.n_clusters} x {candidate.n_components}"
+        fit = fitting.fitted(candidate, name)
+        fits.append((maker.quality_of(*fit), fit))
+        if fits[-1][0] >= options.psnr:
             break
-    good = [found for reached, found in tried if reached >= options.psnr]
-    if not good:
-        return max(tried, key=lambda one: one[0])[1]
-    return min(good, key=lambda found: maker.size_of(*found))
+    sufficient = [fit for quality, fit in fits if quality >= options.psnr]
+    if not sufficient:
+        return max(fits, key=lambda fit: fit[0])[1]
+    return min(sufficient, key=lambda fit: maker.size_of(*fit))
 
 
 def _fitted_to_samples(
-    job: Job,
+    context: Context,
     model: ClusteredModel,
     reader: TexelReader,
-    free: Indices,
+    aligned: Indices,
     blocks: Blocks,
     name: str = "",
 ) -> tuple[ClusteredModel, TexelReader]:
-    """Fit to the samples; half way, frames that are free are improved and nodes made finer."""
-    options = job.options.compression.samples
+    """Fit to the samples; half way, aligned frames are refined and the grid as well."""
+    options = context.options.compression.samples
     first, second = options.halves()
     model = replace(model, residuals=())
-    model = _fitted_once(job, model, reader, first, blocks, f"{name}, part 1")
+    model = _fitted_once(context, model, reader, first, blocks, f"{name}, part 1")
     spread = np.radians(options.frame_spread_deg)
-    if len(free) and spread > 0:
-        better = blocks.map(
+    if len(aligned) and spread > 0:
+        refined = blocks.map(
             f"frames against the model{name}",
-            turned_block,
-            SampleFit(reader, model, spread),
-            reader.blocks_of(free),
+            partial(frames_block, spread=float(spread)),
+            (reader, model),
+            reader.blocks_of(aligned),
         )
         frames = reader.local_from_world.copy()
-        frames[free] = better.joined("frames")
+        frames[aligned] = refined.joined("frames")
         reader = reader.rotated(frames)
     n_functions = len(model.table) * (model.coefficients.shape[1] + 1)
     sides = refined_sides(reader.sides, n_functions, options.fineness)
     model, reader = on_refined_grid(model, sides), replace(reader, sides=sides)
-    return _fitted_once(job, model, reader, second, blocks, f"{name}, part 2"), reader
+    return _fitted_once(context, model, reader, second, blocks, f"{name}, part 2"), reader
 
 
 def _fitted_once(
-    job: Job,
+    context: Context,
     model: ClusteredModel,
     reader: TexelReader,
     options: SampleFitOptions,
     blocks: Blocks,
     part: str,
 ) -> ClusteredModel:
-    """Basis of some texels, then coefficients of all: all samples by blocks."""
+    """Fit the basis to samples of some texels, then the coefficients of all, by blocks."""
+    measured = results.measured_texels(context)
 
     def basis() -> dict[str, NDArray[Any]]:
-        found = fit_basis(
+        fit = fit_basis(
             reader.transformed,
             model,
-            job.seen_texels,
+            measured,
             reader.sample_bytes_per_texel,
             options,
-            workers=job.resources.workers,
-            seed=job.options.seed,
+            workers=context.resources.workers,
+            seed=context.options.seed,
         )
-        return {entry.name: np.asarray(getattr(found, entry.name)) for entry in fields(found)}
+        return {entry.name: np.asarray(getattr(fit, entry.name)) for entry in fields(fit)}
 
     stored: dict[str, Any] = blocks.once(f"basis on the samples{part}", basis)
-    found = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
+    model = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
     parts = blocks.map(
         f"coefficients on the samples{part}",
         coefficients_block,
-        SampleFit(reader, found, 0.0),
-        reader.blocks_of(job.seen_texels),
+        (reader, model),
+        reader.blocks_of(measured),
     )
-    coefficients = found.coefficients.copy()
-    coefficients[job.seen_texels] = parts.joined("coefficients")
-    return replace(found, coefficients=coefficients)
+    coefficients = model.coefficients.copy()
+    coefficients[measured] = parts.joined("coefficients")
+    return replace(model, coefficients=coefficients)
 
 
 def _within_bounds(
-    job: Job, model: ClusteredModel, reader: TexelReader, blocks: Blocks, name: str
+    context: Context, model: ClusteredModel, reader: TexelReader, blocks: Blocks, name: str
 ) -> ClusteredModel:
     """Model of the grids whose texels are bounded where they were not observed.
 
     Those that are brighter there than their samples and their clusters allow are solved for
     on their samples, with as strong a prior as holds them.
     """
-    suspects = beyond_clusters(model, job.seen_texels)
+    measured = results.measured_texels(context)
+    suspects = beyond_clusters(model, measured)
     if not len(suspects):
         return model
     noise = blocks.once(
-        f"errors of the samples{name}", lambda: {"noise": _noise(job, model, reader)}
+        f"errors of the samples{name}", lambda: {"noise": _noise(context, model, reader)}
     )["noise"]
-    model = normalised(model, float(noise), job.seen_texels)
+    model = normalised(model, float(noise), measured)
     parts = blocks.map(
         f"coefficients within bounds{name}",
         bounded_block,
-        SampleFit(reader, model, 0.0),
+        (reader, model),
         reader.blocks_of(suspects),
     )
     coefficients = model.coefficients.copy()
@@ -212,47 +222,34 @@ def _within_bounds(
     return replace(model, coefficients=coefficients)
 
 
-@dataclass(frozen=True, eq=False)
-class SampleFit:
-    """What all blocks of texels share that are fitted to their samples.
-
-    Parameters
-    ----------
-    reader : TexelReader
-    model : ClusteredModel
-    spread : float
-        Of the frames, radians.
-    """
-
-    reader: TexelReader
-    model: ClusteredModel
-    spread: float
+def frames_block(
+    shared: tuple[TexelReader, ClusteredModel], texels: Indices, *, spread: float
+) -> dict[str, Floats]:
+    """Return frames of some texels, refined against the model; `spread` in radians."""
+    reader, model = shared
+    return {"frames": refined_frames(reader, model, texels, spread)}
 
 
-def turned_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
-    """Frames of some texels, improved against the model."""
-    return {"frames": refined_frames(context.reader, context.model, texels, context.spread)}
-
-
-def coefficients_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
-    """Coefficients of some texels in the basis of the model."""
+def coefficients_block(
+    shared: tuple[TexelReader, ClusteredModel], texels: Indices
+) -> dict[str, Floats]:
+    """Return coefficients of some texels in the basis of the model."""
+    reader, model = shared
     with ThreadPoolExecutor(1) as pool:
-        found, _ = solve_coefficients(
-            context.reader.transformed(texels),
-            context.model.cluster[texels],
-            context.model,
-            pool,
-            bounded=True,
+        coefficients, _ = solve_coefficients(
+            reader.transformed(texels), model.cluster[texels], model, pool, bounded=True
         )
-    return {"coefficients": found}
+    return {"coefficients": coefficients}
 
 
-def _noise(job: Job, model: ClusteredModel, reader: TexelReader) -> NDArray[np.float64]:
+def _noise(context: Context, model: ClusteredModel, reader: TexelReader) -> NDArray[np.float64]:
     """Variance of samples about the model of the grids, from some texels."""
-    seen, most = job.seen_texels, job.options.compression.samples.max_bytes
-    count = min(len(seen), TEXELS_FOR_NOISE, max(1, most // reader.sample_bytes_per_texel))
-    some = np.sort(np.random.default_rng(job.options.seed).choice(seen, count, replace=False))
-    usual = normalised(model, model.residuals[-1] ** 2, seen)
+    measured = results.measured_texels(context)
+    options = context.options
+    most = max(1, options.compression.samples.max_bytes // reader.sample_bytes_per_texel)
+    count = min(len(measured), TEXELS_FOR_NOISE, most)
+    some = np.sort(np.random.default_rng(options.seed).choice(measured, count, replace=False))
+    usual = normalised(model, model.residuals[-1] ** 2, measured)
     with ThreadPoolExecutor(1) as pool:
         _, squares = solve_coefficients(
             reader.transformed(some), usual.cluster[some], usual, pool
@@ -260,15 +257,18 @@ def _noise(job: Job, model: ClusteredModel, reader: TexelReader) -> NDArray[np.f
     return np.asarray(squares[:, 0].sum() / max(squares[:, 1].sum(), 1e-30))
 
 
-def bounded_block(context: SampleFit, texels: Indices) -> dict[str, Floats]:
-    """Coefficients of some texels; of those beyond their bounds, ones within."""
-    model, samples = context.model, context.reader.transformed(texels)
+def bounded_block(
+    shared: tuple[TexelReader, ClusteredModel], texels: Indices
+) -> dict[str, Floats]:
+    """Return coefficients of some texels; of those beyond their bounds, ones within."""
+    reader, model = shared
+    samples = reader.transformed(texels)
     cluster, coefficients = model.cluster[texels], model.coefficients[texels]
     beyond = beyond_bounds(samples, cluster, coefficients, probes(model.table))
     if beyond.any():
         with ThreadPoolExecutor(1) as pool:
-            found, _ = solve_coefficients(
+            bounded, _ = solve_coefficients(
                 samples, cluster, model, pool, bounded=True, deviation=GRID_DEVIATION
             )
-        coefficients[beyond] = found[beyond]
+        coefficients[beyond] = bounded[beyond]
     return {"coefficients": coefficients}

@@ -14,53 +14,73 @@ from reflfield.observations.image_projection import (
     project_photographs,
 )
 from reflfield.observations.light_agreement import looks_at, other_light_axes
-from reflfield.observations.store import open_samples
-from reflfield.pipeline.cache import WARNINGS
+from reflfield.observations.store import Location, open_samples, place_of
+from reflfield.pipeline import results
+from reflfield.pipeline.cache import WARNINGS, key_of
 from reflfield.pipeline.clipped_values import check_measured, clipping_lines, write_measured
-from reflfield.pipeline.context import ELSEWHERE, Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import writers_at_once
+from reflfield.pipeline.results import ELSEWHERE, SAMPLES
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
-def write_observations(job: Job, folder: Path) -> dict[str, Any]:
-    """Apparent BRDF samples of all texels, on disk; what of them was not measured is told."""
-    location = job.new_samples_location(folder)
+def write_observations(context: Context, folder: Path) -> dict[str, Any]:
+    """Write apparent BRDF samples of all texels; warn of what was not measured."""
+    location = new_samples_location(context, folder)
     projection = Projection(
-        job.training, job.texels.position, job.view_seen, location, job.resources.block_bytes
+        context.training,
+        results.texels(context).position,
+        results.view_visible(context),
+        location,
+        context.resources.block_bytes,
     )
-    found = project_photographs(projection, job.blocks(folder), writers_at_once(job))
-    check_measured(job.training, found)
-    write_measured(folder, found.measured)
-    for line in clipping_lines(job.training, found):
-        logger.warning("%s", line)
-    n_samples = job.view_seen.size * job.training.n_lights
+    projected = project_photographs(
+        projection, context.blocks(folder), writers_at_once(context)
+    )
+    check_measured(context.training, projected)
+    write_measured(folder, projected.measured)
+    for line in clipping_lines(context.training, projected):
+        log.warning("%s", line)
+    n_samples = results.view_visible(context).size * context.training.n_lights
     return {
-        "photographs": found.photographs,
+        "photographs": projected.photographs,
         "samples": n_samples,
         "raw bytes": n_samples * 6,
-        **{f"values {kind}": found.count(kind) for kind in VALUE_KINDS},
-        WARNINGS: misread_lights(job, found.looked_into),
+        **{f"values {kind}": projected.count(kind) for kind in VALUE_KINDS},
+        WARNINGS: misread_lights(context, projected.looked_into),
     }
 
 
-def misread_lights(job: Job, samples: LookedInto) -> list[str]:
-    """A warning where the lights are plainly in other axes than the cameras."""
-    if job.is_plane:  # all its points face one way
+def new_samples_location(context: Context, folder: Path) -> Location:
+    """Return where the stage that is computed into a folder puts the samples.
+
+    In a store, in a place of its own for each key, which is noted in the folder.
+    """
+    if context.resources.store is None:
+        return folder / SAMPLES
+    location = place_of(context.resources.store, key_of(folder))
+    (folder / ELSEWHERE).write_text(location)
+    return location
+
+
+def misread_lights(context: Context, samples: LookedInto) -> list[str]:
+    """Return a warning where the lights are plainly in other axes than the cameras."""
+    if context.is_plane:  # all its points face one way
         return []
     looks = looks_at(
-        job.training,
+        context.training,
         samples.photograph,
-        job.texels.position[samples.texel],
-        job.texels.normal[samples.texel],
+        results.texels(context).position[samples.texel],
+        results.texels(context).normal[samples.texel],
         samples.brightness(),
     )
-    words = other_light_axes(list(looks))
-    return [words] if words else []
+    warning = other_light_axes(list(looks))
+    return [warning] if warning else []
 
 
-def lost_observations(job: Job, folder: Path) -> str:
-    """What is wrong with the samples in a store elsewhere; empty if nothing is.
+def lost_observations(context: Context, folder: Path) -> str:
+    """Return what is wrong with the samples in a store elsewhere; empty if nothing is.
 
     Its chunks are verified as they are read.
     """

@@ -20,7 +20,7 @@ from reflfield.errors import InputError
 from reflfield.options import write_toml
 from reflfield.pipeline import model_selection
 from reflfield.pipeline.cache import StageFolder, plain, read_record, versions
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.util.checksums import agrees
 from reflfield.util.files import naming, replacing, unfinished_name
 
@@ -40,7 +40,7 @@ TIMINGS, OPTIONS = "timings.json", "options.toml"
 OUTDATED = "outdated"
 
 
-def publish(job: Job) -> None:
+def publish(context: Context) -> None:
     """Copy what the stages have made to its place in the output folder, each file whole.
 
     Called as soon as there is a field, so that no later failure withholds it. What is there
@@ -53,36 +53,38 @@ def publish(job: Job) -> None:
     """
     changed = {
         target: source
-        for target, source, recorded in _results(job)
-        if not agrees(job.out / target, recorded)
+        for target, source, recorded in _results(context)
+        if not agrees(context.out / target, recorded)
     }
     for target in (target for files in RESULTS.values() for target in files.values()):
-        unfinished_name(job.out / target).unlink(missing_ok=True)  # of a run that was killed
-    for target in _outdated(job):
-        _move(job.out / target, job.out / OUTDATED / target)
-    with naming(job.out), ExitStack() as together:
+        unfinished_name(context.out / target).unlink(
+            missing_ok=True
+        )  # of a run that was killed
+    for target in _outdated(context):
+        _move(context.out / target, context.out / OUTDATED / target)
+    with naming(context.out), ExitStack() as together:
         # Renamed when the stack is left, the first listed last.
         for target, source in changed.items():
-            (job.out / target).parent.mkdir(parents=True, exist_ok=True)
-            partial = together.enter_context(replacing(job.out / target))
+            (context.out / target).parent.mkdir(parents=True, exist_ok=True)
+            partial = together.enter_context(replacing(context.out / target))
             shutil.copyfile(source, partial)
-            _check_copy(job, partial, source)
+            _check_copy(context, partial, source)
     for target in changed:
-        (job.out / OUTDATED / target).unlink(missing_ok=True)
-    _remove_empty(job.out / OUTDATED)
+        (context.out / OUTDATED / target).unlink(missing_ok=True)
+    _remove_empty(context.out / OUTDATED)
 
 
-def _results(job: Job) -> Iterator[tuple[str, Path, Mapping[str, Any]]]:
+def _results(context: Context) -> Iterator[tuple[str, Path, Mapping[str, Any]]]:
     """Name, file and checksum of every result of the stages that have run."""
     for stage, files in RESULTS.items():
-        if job.stages.record(stage) is not None:
-            folder = job.stages.root / stage
+        if context.stages.record(stage) is not None:
+            folder = context.stages.root / stage
             recorded = read_record(folder)["checksums"]["files"]
             for source, target in files.items():
                 yield target, folder / source, recorded[source]
 
 
-def _check_copy(job: Job, copy: Path, source: Path) -> None:
+def _check_copy(context: Context, copy: Path, source: Path) -> None:
     recorded = read_record(source.parent)["checksums"]["files"][source.name]
     if not agrees(copy, recorded):
         raise InputError(
@@ -91,15 +93,15 @@ def _check_copy(job: Job, copy: Path, source: Path) -> None:
         )
 
 
-def _outdated(job: Job) -> Iterator[str]:
+def _outdated(context: Context) -> Iterator[str]:
     """Results in the output folder that do not follow from the stages that have run."""
     for stage, files in RESULTS.items():
-        if job.stages.record(stage) is not None:
+        if context.stages.record(stage) is not None:
             continue
-        recorded = read_record(job.stages.root / stage)
-        current = key_that_follows(job.stages, stage) is not None
+        recorded = read_record(context.stages.root / stage)
+        current = key_that_follows(context.stages, stage) is not None
         for source, target in files.items():
-            path = job.out / target
+            path = context.out / target
             if path.is_file() and not (
                 current and agrees(path, recorded["checksums"]["files"].get(source, {}))
             ):
@@ -141,51 +143,51 @@ def _remove_empty(folder: Path) -> None:
             each.rmdir()
 
 
-def publish_records(job: Job, last: str, *, whole: bool) -> None:
+def publish_records(context: Context, last: str, *, whole: bool) -> None:
     """Write how long the stages took, and with which options they ran.
 
     Parameters
     ----------
-    job : Job
+    context : Context
     last : str
         The stage that the run ended with.
     whole : bool
         Whether that is the last one there is.
     """
-    notes = list(model_selection.words_of(job))
+    notes = list(model_selection.sentences(context))
     if not whole:
         notes.append(
-            f"Of a run up to the stage {last!r}: later results have options of theirs."
+            f"Of a run up to the stage {last!r}: later results have options of their own."
         )
-    with replacing(job.out / TIMINGS) as partial:
-        partial.write_text(json.dumps(timings(job), indent=1) + "\n")
-    with replacing(job.out / OPTIONS) as partial:
-        write_toml(partial, job.asked_options, notes)
-    folder = job.out / OUTDATED
+    with replacing(context.out / TIMINGS) as partial:
+        partial.write_text(json.dumps(timings(context), indent=1) + "\n")
+    with replacing(context.out / OPTIONS) as partial:
+        write_toml(partial, context.asked_options, notes)
+    folder = context.out / OUTDATED
     left = [p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()]
     if left:
         log.warning("%s: made from other stages than now: %s", folder, ", ".join(sorted(left)))
 
 
-def published(job: Job) -> list[Path]:
+def published(context: Context) -> list[Path]:
     """Results of this run in the output folder; none that an earlier run has left there."""
     names = [
         target
         for stage, files in RESULTS.items()
-        if job.stages.record(stage) is not None
+        if context.stages.record(stage) is not None
         for target in files.values()
     ]
-    return [job.out / name for name in (*names, TIMINGS)]
+    return [context.out / name for name in (*names, TIMINGS)]
 
 
-def timings(job: Job) -> dict[str, Any]:
+def timings(context: Context) -> dict[str, Any]:
     """Time, memory, sizes and counts of every stage, with versions."""
-    records = [plain(asdict(record)) for record in job.stages.records]
+    records = [plain(asdict(record)) for record in context.stages.records]
     return {
         "stages": records,
-        "seconds": model_selection.total_seconds(job),
+        "seconds": model_selection.total_seconds(context),
         "peak_bytes": max((record["peak_bytes"] for record in records), default=0),
-        "workers": job.resources.workers,
-        "max_memory": job.resources.max_memory,
+        "workers": context.resources.workers,
+        "max_memory": context.resources.max_memory,
         "versions": versions(),
     }

@@ -25,8 +25,9 @@ from reflfield.field.step_search import field_of_quality, field_of_size
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.image_projection import directions_of
 from reflfield.observations.texel_reading import TexelReader
+from reflfield.pipeline import results
 from reflfield.pipeline.cache import versions
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.util.progress import track
 
 Floats = NDArray[np.float32]
@@ -40,7 +41,7 @@ SAMPLES_MEASURED = 100_000
 FINE_SHARE = 1 / 64
 # 0 dB would not be asked for at all.
 LEAST_PSNR = 0.01
-# A field found for a quality is taken to reach it within this.
+# A field counts as reaching a quality within this.
 CLOSE_DB = 0.005
 # The finished field is measured on other samples than the search: a missing quality that is
 # less may be by chance.
@@ -53,20 +54,20 @@ class FieldMaker:
 
     Parameters
     ----------
-    job : Job
+    context : Context
     options : CompressionOptions
     made_with : dict
         All options, for the metadata.
     """
 
-    job: Job
+    context: Context
     options: CompressionOptions
     made_with: dict[str, Any]
 
     @property
     def searches(self) -> bool:
         """Whether clusters and components are chosen by size or quality."""
-        asked = self.job.options.compression
+        asked = self.context.options.compression
         return self.options is asked and (asked.size > 0 or asked.psnr > 0)
 
     def fitted(self, model: ClusteredModel, frames: Floats) -> FittedReflectance:
@@ -77,25 +78,25 @@ class FieldMaker:
             coefficients=model.coefficients,
             mean=model.mean,
             basis=model.basis,
-            domain=self.job.options.resampling.domain,  # type: ignore[arg-type]
-            indirect=self.job.indirect_light,
+            domain=self.context.options.resampling.domain,  # type: ignore[arg-type]
+            indirect=results.indirect_light(self.context),
         )
 
     def build(self, model: ClusteredModel, frames: Floats, step: float) -> ClusteredField:
         """Quantise the model on the base surface into a field."""
-        job, atlas = self.job, self.job.surface_atlas
+        context, atlas = self.context, results.atlas(self.context)
         surface = BaseSurface(
             positions=atlas.positions,
             faces=atlas.faces,
             uv=atlas.uv,
-            texel_of_pixel=job.texels.texel_of_pixel,
+            texel_of_pixel=results.texels(context).texel_of_pixel,
         )
         return build_field(
             surface,
             self.fitted(model, frames),
-            visibility=job.visibility_kind,  # type: ignore[arg-type]
-            light_model="known" if job.training.lights_known else "unknown",
-            metadata=field_metadata(job, self.made_with),
+            visibility=context.visibility_kind,  # type: ignore[arg-type]
+            light_model="known" if context.training.lights_known else "unknown",
+            metadata=field_metadata(context, self.made_with),
             quantisation=Quantisation(step),
         )
 
@@ -115,9 +116,14 @@ class FieldMaker:
 
     def quality(self, field: ClusteredField) -> float:
         """LDR PSNR on the samples, dB."""
-        job = self.job
-        found = sample_error(field, job.base_reader, job.seen_texels, SAMPLES_MEASURED)
-        return found.psnr_ldr
+        context = self.context
+        error = sample_error(
+            field,
+            results.base_reader(context),
+            results.measured_texels(context),
+            SAMPLES_MEASURED,
+        )
+        return error.psnr_ldr
 
     def quality_of(self, model: ClusteredModel, reader: TexelReader) -> float:
         """LDR PSNR on the samples of a model that is hardly quantised, dB."""
@@ -146,7 +152,7 @@ class FieldMaker:
         gain : float
             By which the fit to the samples raises the quality of a model, dB.
         """
-        n_seen, options = len(self.job.seen_texels), self.options
+        n_seen, options = len(results.measured_texels(self.context)), self.options
         tried = [n for n in CLUSTERS_TRIED if n == 1 or n * COMPONENTS_TRIED <= n_seen]
         goal = max(options.psnr - gain, LEAST_PSNR) if options.psnr else 0.0
         maker = replace(self, options=replace(options, psnr=goal))
@@ -181,34 +187,36 @@ def components_used(field: ClusteredField) -> int:
     return int(used[-1]) + 1 if len(used) else 0
 
 
-def field_metadata(job: Job, made_with: dict[str, Any]) -> dict[str, Any]:
+def field_metadata(context: Context, made_with: dict[str, Any]) -> dict[str, Any]:
     """What a field says of its making: nothing that a change would not make again."""
     later = ("relighting", "comparison")
     options = {name: value for name, value in made_with.items() if name not in later}
-    observed = {"observed_lights": observed_lights(job)} if job.finds_indirect_light else {}
+    observed = (
+        {"observed_lights": observed_lights(context)} if context.fits_indirect_light else {}
+    )
     return {
-        "capture": job.capture.name,
-        "up": job.capture.up.tolist(),
+        "capture": context.capture.name,
+        "up": context.capture.up.tolist(),
         **observed,
-        "views": job.training.n_views,
-        "lights": job.training.n_lights,
-        "photographs": len(job.training.photographs),
-        "held_out": held_out(job),
+        "views": context.training.n_views,
+        "lights": context.training.n_lights,
+        "photographs": len(context.training.photographs),
+        "held_out": held_out(context),
         "options": options,
         "versions": versions(),
     }
 
 
-def held_out(job: Job) -> dict[str, int]:
+def held_out(context: Context) -> dict[str, int]:
     """What of the capture did not make the field."""
-    held = {"views": job.hold_out.views, "lights": job.hold_out.lights}
-    chosen = job.hold_out.photographs > 0 or job.hold_out.test
-    return held | ({"photographs": len(job.split.compared)} if chosen else {})
+    held = {"views": context.hold_out.views, "lights": context.hold_out.lights}
+    chosen = context.hold_out.photographs > 0 or context.hold_out.test
+    return held | ({"photographs": len(context.split.compared)} if chosen else {})
 
 
-def missed_quality(job: Job) -> str:
+def missed_quality(context: Context) -> str:
     """What to say of a quality that was asked for and is not reached; empty where it is."""
-    record, asked = job.stages.record("compression"), job.options.compression.psnr
+    record, asked = context.stages.record("compression"), context.options.compression.psnr
     if record is None or not asked:
         return ""
     reached = record.counts["LDR PSNR of the samples, dB"]
@@ -221,8 +229,8 @@ def missed_quality(job: Job) -> str:
     )
 
 
-def observed_lights(job: Job) -> list[list[float]]:
+def observed_lights(context: Context) -> list[list[float]]:
     """Directions from the object's centre to the lights, rounded."""
-    centre = job.texels.position.mean(axis=0, dtype=np.float64)
-    _, lights = directions_of(job.training, centre[None])
+    centre = results.texels(context).position.mean(axis=0, dtype=np.float64)
+    _, lights = directions_of(context.training, centre[None])
     return distinct_directions(lights[0]).tolist()

@@ -12,12 +12,12 @@ from reflfield.field.file import PackedSizes
 from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
 from reflfield.metrics.held_out_photographs import compare_with_photographs
 from reflfield.metrics.image_metrics import NothingToMeasure
-from reflfield.pipeline.compared_photographs import frame_sets
+from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.comparison import MAIN, variants
 from reflfield.pipeline.compression import stored_model
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.half_vector_fit import HalfVectorFit, stored_half_vector
-from reflfield.pipeline.held_out_silhouettes import silhouettes_of_frames
+from reflfield.pipeline.held_out_silhouettes import silhouettes_of
 from reflfield.pipeline.memory import within_memory
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.report.sections import RatePoint
@@ -31,39 +31,42 @@ PAPER = "half floats, not factored"
 POINTS = "points.json"
 
 
-def write_rate_distortion(job: Job, folder: Path) -> dict[str, Any]:
+def write_rate_distortion(context: Context, folder: Path) -> dict[str, Any]:
     """Size and quality of every model at every step, and in the layout of the paper."""
-    points = _clustered_points(job) if job.options.aligns else _half_vector_points(job)
+    aligns = context.options.aligns
+    points = _clustered_points(context) if aligns else _half_vector_points(context)
     (folder / POINTS).write_text(json.dumps([asdict(point) for point in points], indent=1))
     return {"fields": len(points)}
 
 
-def _half_vector_points(job: Job) -> list[RatePoint]:
-    fit, model, sizes = HalfVectorFit(job.refined), stored_half_vector(job), PackedSizes()
-    points = []
+def _half_vector_points(context: Context) -> list[RatePoint]:
+    fit, model = HalfVectorFit(context.refined), stored_half_vector(context)
+    sizes, points = PackedSizes(), []
     for coarseness in track(COARSENESS, len(COARSENESS), "quality against size"):
         field = fit.build(model, fit.step(coarseness))
-        points.append(_point(job, fit.quality(field), field, HALF_VECTOR, sizes.of(field)))
+        size = sizes.of(field)
+        points.append(_point(context, fit.quality(field), field, HALF_VECTOR, size))
     return points
 
 
-def _clustered_points(job: Job) -> list[RatePoint]:
-    todo = [(v, stage, c) for v, stage in variants(job).items() for c in COARSENESS]
-    maker, sizes, points = FieldMaker(job, job.options.compression, {}), PackedSizes(), []
+def _clustered_points(context: Context) -> list[RatePoint]:
+    todo = [(v, stage, c) for v, stage in variants(context).items() for c in COARSENESS]
+    maker = FieldMaker(context, context.options.compression, {})
+    sizes, points = PackedSizes(), []
     for variant, stage, coarseness in track(todo, len(todo), "quality against size"):
-        model, frames = stored_model(job, stage)
+        model, frames = stored_model(context, stage)
         field = maker.build(model, frames, coarseness * model.residuals[-1])
         quality = maker.quality(field)
-        points.append(_point(job, quality, field, CURVES[variant], sizes.of(field)))
-    model, frames = stored_model(job, "compression")
+        points.append(_point(context, quality, field, CURVES[variant], sizes.of(field)))
+    model, frames = stored_model(context, "compression")
     exact = maker.build(model, frames, 0.0)
     size = unfactored_bytes(exact, sizes)
-    return [*points, _point(job, maker.quality(exact), exact, PAPER, size)]
+    return [*points, _point(context, maker.quality(exact), exact, PAPER, size)]
 
 
-def stored_points(job: Job) -> list[RatePoint]:
+def stored_points(context: Context) -> list[RatePoint]:
     """What the stage has written."""
-    stored = json.loads((job.stages.root / "rate_distortion" / POINTS).read_text())
+    stored = json.loads((context.stages.root / "rate_distortion" / POINTS).read_text())
     return [RatePoint(**point) for point in stored]
 
 
@@ -80,18 +83,18 @@ def unfactored_bytes(field: ClusteredField, sizes: PackedSizes) -> int:
 
 
 def _point(
-    job: Job, quality: float, field: ReflectanceField, curve: str, size: int
+    context: Context, quality: float, field: ReflectanceField, curve: str, size: int
 ) -> RatePoint:
     heldout = None
-    sets = frame_sets(job)
+    sets = compared_photographs(context)
     if "heldout" in sets:
-        options = within_memory(job.options.relighting, job.resources)
+        options = within_memory(context.options.relighting, context.resources)
         with TemporaryDirectory() as scratch:
-            frames = sets["heldout"]
-            silhouettes = silhouettes_of_frames(job, "heldout", frames)
+            photographs = sets["heldout"]
+            silhouettes = silhouettes_of(context, "heldout", photographs)
             try:
                 heldout = compare_with_photographs(
-                    field, frames, silhouettes, Path(scratch), options
+                    field, photographs, silhouettes, Path(scratch), options
                 ).mean["psnr_ldr"]
             except NothingToMeasure:
                 heldout = None

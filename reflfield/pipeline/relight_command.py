@@ -1,4 +1,4 @@
-"""The command "relight": images of a field for given frames, or as a turntable."""
+"""The command "relight": images of a field for the cameras and lights of a capture."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_relit_frames(
     InputError
         If a frame cannot be relit, or a file of the frames would be replaced.
     """
-    check_kept(frames, _pictures(frames, out))
+    check_kept(frames, image_files(frames, out))
     with filling(out) as partial:
         made = [frame.exr for frame in relight_photographs(field, frames, partial, options)]
     return [out / path.name for path in made]
@@ -63,6 +63,7 @@ def check_kept(frames: Capture, written: Iterable[Path]) -> None:
             )
 
 
-def _pictures(frames: Capture, folder: Path) -> list[Path]:
+def image_files(frames: Capture, folder: Path) -> list[Path]:
+    """Return the files that a capture's images are written to."""
     names = [photograph.name for photograph in frames.photographs]
     return [folder / f"{name}.{kind}" for name in names for kind in ("exr", "png")]

@@ -16,128 +16,134 @@ from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.metrics.held_out_photographs import RelitPairs
 from reflfield.metrics.image_metrics import Comparison
-from reflfield.pipeline import comparison, hold_out, model_selection
+from reflfield.pipeline import comparison, hold_out, model_selection, results
 from reflfield.pipeline.atlas import METHOD
 from reflfield.pipeline.cache import plain, versions
-from reflfield.pipeline.compared_photographs import frame_sets
-from reflfield.pipeline.context import Job
-from reflfield.pipeline.held_out_silhouettes import silhouettes_of_frames
+from reflfield.pipeline.compared_photographs import compared_photographs
+from reflfield.pipeline.context import Context
+from reflfield.pipeline.held_out_silhouettes import silhouettes_of
 from reflfield.pipeline.hull import LEFT_OUT
 from reflfield.pipeline.maps import AVERAGES
 from reflfield.pipeline.quantisation_search import missed_quality
 from reflfield.pipeline.rate_distortion import stored_points
-from reflfield.pipeline.sample_bookkeeping import accounts_of
+from reflfield.pipeline.sample_bookkeeping import sample_counts
 from reflfield.pipeline.truth_comparison import TruthScores, truth_scores
 from reflfield.report import sections
 from reflfield.report.page import ReportContent, Section, write_report
 
-# Sets of frames that are compared: title and sentence.
+# Sets of photographs that are compared: title and sentence.
 FRAME_TITLES = {
     "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
     "truth": ("Unseen views and lights", "Simulated from cameras and lights off the rig."),
 }
 
 
-def write_report_page(job: Job, folder: Path) -> dict[str, Any]:
-    """The page: everything that was found."""
-    field = open_field(job.stages.root / "compression" / "field.rfld")
-    scores = truth_scores(job, field)
-    content = report_content(job, field, job.result("maps", AVERAGES)["average"], scores)
+def write_report_page(context: Context, folder: Path) -> dict[str, Any]:
+    """Write the page of all results."""
+    field = open_field(results.field_file(context))
+    scores = truth_scores(context, field)
+    content = report_content(
+        context, field, results.arrays(context, "maps", AVERAGES)["average"], scores
+    )
     write_report(folder / "index.html", content)
     problems = scores.problems if scores is not None else ()
     return {"sections": len(content.sections), comparison.PROBLEMS: list(problems)}
 
 
 def report_content(
-    job: Job,
+    context: Context,
     field: ReflectanceField,
     average: NDArray[np.float32],
     scores: TruthScores | None,
 ) -> ReportContent:
     """All sections of the page, in the order of the stages."""
-    compared = {name: comparison.comparison_of(job, name) for name in frame_sets(job)}
+    compared = {
+        name: comparison.comparison_of(context, name) for name in compared_photographs(context)
+    }
     main = compared.get("heldout") or compared.get("truth")
     parts = [
-        *_frames_sections(job, compared),
-        *_choices_sections(job),
-        *_ablation_sections(job, compared),
-        *_rate_sections(job),
-        *_surface_sections(job, field, average),
-        *_alignment_sections(job),
+        *_frames_sections(context, compared),
+        *_selection_sections(context),
+        *_ablation_sections(context, compared),
+        *_rate_sections(context),
+        *_surface_sections(context, field, average),
+        *_alignment_sections(context),
         *_truth_sections(scores, compared.get("truth")),
-        _compression_section(job),
-        sections.bookkeeping_section(list(accounts_of(job))),
-        sections.stages_section([_stage(record) for record in job.stages.records]),
-        sections.run_section(plain(job.options), versions()),
+        _compression_section(context),
+        sections.bookkeeping_section(list(sample_counts(context))),
+        sections.stages_section([_stage(record) for record in context.stages.records]),
+        sections.run_section(plain(context.options), versions()),
     ]
-    counts = job.stages.records[-1] if job.stages.records else None
-    size = (job.stages.root / "compression" / "field.rfld").stat().st_size
+    counts = context.stages.records[-1] if context.stages.records else None
+    size = (results.field_file(context)).stat().st_size
     return ReportContent(
-        title=job.capture.name,
-        subtitle=_subtitle(job),
+        title=context.capture.name,
+        subtitle=_subtitle(context),
         key_numbers=sections.key_numbers(
             main,
             file_bytes=size,
-            raw_bytes=raw_bytes(job),
-            seconds=model_selection.total_seconds(job),
+            raw_bytes=raw_bytes(context),
+            seconds=model_selection.total_seconds(context),
         ),
         sections=tuple(parts),
         warnings=tuple(
-            dict.fromkeys((*warnings_of(job), *(scores.problems if scores else ())))
+            dict.fromkeys((*warnings_of(context), *(scores.problems if scores else ())))
         ),
-        footer="" if counts is None else f"Stages in {job.stages.root.name}/",
+        footer="" if counts is None else f"Stages in {context.stages.root.name}/",
     )
 
 
-def _subtitle(job: Job) -> str:
-    training = job.training
+def _subtitle(context: Context) -> str:
+    training = context.training
     return (
         f"{training.n_views} views, {training.n_lights} lights, {len(training.photographs)} "
-        f"photographs, {job.base_reader.n_texels} texels. "
-        f"Held out: {hold_out.held_out_words(job.split)}."
+        f"photographs, {results.base_reader(context).n_texels} texels. "
+        f"Held out: {hold_out.held_out_sentence(context.split)}."
     )
 
 
-def raw_bytes(job: Job) -> int:
+def raw_bytes(context: Context) -> int:
     """Samples of the capture as half floats, unobserved ones included."""
-    return int(np.prod(job.observed.views.shape)) * job.training.n_lights * 3 * 2
+    return (
+        int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 3 * 2
+    )
 
 
-def problems_of(job: Job) -> Iterator[str]:
+def problems_of(context: Context) -> Iterator[str]:
     """What could not be compared, and why; each once."""
-    records = job.stages.records
-    found = (text for r in records for text in r.counts.get(comparison.PROBLEMS, ()))
-    yield from dict.fromkeys(found)
+    records = context.stages.records
+    problems = (text for r in records for text in r.counts.get(comparison.PROBLEMS, ()))
+    yield from dict.fromkeys(problems)
 
 
-def warnings_of(job: Job) -> Iterator[str]:
+def warnings_of(context: Context) -> Iterator[str]:
     """What a user should look at first."""
-    for record in job.stages.records:
-        yield from job.stages.warnings(record.name)
-    yield from hold_out.left_out_words(job.capture, job.split)
-    yield from filter(None, [missed_quality(job)])
-    yield from problems_of(job)
-    unseen = job.base_reader.n_texels - len(job.seen_texels)
+    for record in context.stages.records:
+        yield from context.stages.warnings(record.name)
+    yield from hold_out.left_out_sentences(context.capture, context.split)
+    yield from filter(None, [missed_quality(context)])
+    yield from problems_of(context)
+    n_texels = results.base_reader(context).n_texels
+    unseen = n_texels - len(results.measured_texels(context))
     if unseen:
-        share = unseen / job.base_reader.n_texels
         yield (
-            f"{unseen} of {job.base_reader.n_texels} texels ({share:.0%}) have no sample; they "
+            f"{unseen} of {n_texels} texels ({unseen / n_texels:.0%}) have no sample; they "
             "repeat the nearest texel that has."
         )
-    missing = int((~job.observed.pairs).sum())
+    missing = int((~results.observed(context).pairs).sum())
     if missing:
-        total = job.observed.pairs.size
+        total = results.observed(context).pairs.size
         yield f"{missing} of {total} pairs of view and light have no photograph."
 
 
 def _surface_sections(
-    job: Job, field: ReflectanceField, average: NDArray[np.float32]
+    context: Context, field: ReflectanceField, average: NDArray[np.float32]
 ) -> Iterator[Section]:
-    texels = job.texels
-    origin = job.training.silhouette_origin(0)
-    hull, made = job.stages.record("hull"), job.stages.record("atlas")
+    texels = results.texels(context)
+    origin = context.training.silhouette_origin(0)
+    hull, made = context.stages.record("hull"), context.stages.record("atlas")
     yield sections.silhouettes_section(
-        _silhouette_views(job),
+        _silhouette_views(context),
         origin={
             "file": "given with the capture",
             "alpha": "alpha of the photographs",
@@ -155,76 +161,83 @@ def _surface_sections(
         },
     )
     yield sections.coverage_section(
-        texels.texel_of_pixel, job.view_seen.sum(axis=1), job.observed.lights.sum(axis=1)
+        texels.texel_of_pixel,
+        results.view_visible(context).sum(axis=1),
+        results.observed(context).lights.sum(axis=1),
     )
     yield sections.normals_section(
         texels.texel_of_pixel, field.local_from_world, texels.local_from_world
     )
 
 
-def _silhouette_views(job: Job) -> Iterator[sections.SilhouetteView]:
-    scene = RayScene(job.surface_atlas.mesh, threads=job.resources.workers)
-    for i, camera in enumerate(job.training.cameras):
-        photographs = job.training.photograph_index[i]
+def _silhouette_views(context: Context) -> Iterator[sections.SilhouetteView]:
+    scene = RayScene(results.atlas(context).mesh, threads=context.resources.workers)
+    for i, camera in enumerate(context.training.cameras):
+        photographs = context.training.photograph_index[i]
         photographed = photographs[photographs >= 0]
         yield sections.SilhouetteView(
             name=camera.id,
             photograph=(
-                job.training.read_photograph(int(photographed[0]))
+                context.training.read_photograph(int(photographed[0]))
                 if len(photographed)
                 else np.zeros((camera.height, camera.width, 3), np.float32)
             ),
-            silhouette=job.view_silhouettes[i],
+            silhouette=results.silhouettes(context)[i],
             hull_silhouette=scene.silhouette(camera),
         )
 
 
-def _frames_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterator[Section]:
-    for name, pairs in comparison.relit_pairs(job).items():
+def _frames_sections(
+    context: Context, compared: dict[str, Comparison | None]
+) -> Iterator[Section]:
+    for name, pairs in comparison.relit_pairs(context).items():
         measured = compared[name]
         if measured is not None:
             title, intro = FRAME_TITLES[name]
             yield sections.held_out_section(measured, pairs, title=title, intro=intro)
 
 
-def _ablation_sections(job: Job, compared: dict[str, Comparison | None]) -> Iterator[Section]:
+def _ablation_sections(
+    context: Context, compared: dict[str, Comparison | None]
+) -> Iterator[Section]:
     """With alignment against without, if the options ask for it."""
-    if not job.options.compares_without_alignment:
+    if not context.options.compares_without_alignment:
         return
-    counts = {record.name: record.counts for record in job.stages.records}
+    counts = {record.name: record.counts for record in context.stages.records}
     names = {comparison.MAIN: "with alignment", comparison.WITHOUT: "without alignment"}
     variants, pairs = [], []
-    for variant, stage in comparison.variants(job).items():
-        found = compared
+    for variant, stage in comparison.variants(context).items():
+        of_variant = compared
         if variant != comparison.MAIN:
-            found = {n: comparison.comparison_of(job, n, variant) for n in compared}
-        variants.append(_variant(names[variant], found, counts[stage]))
-        pairs.append(next(iter(comparison.relit_pairs(job, variant).values()), ()))
+            of_variant = {n: comparison.comparison_of(context, n, variant) for n in compared}
+        variants.append(_variant(names[variant], of_variant, counts[stage]))
+        pairs.append(next(iter(comparison.relit_pairs(context, variant).values()), ()))
     yield sections.ablation_section(variants, pairs)
 
 
-def _choices_sections(job: Job) -> Iterator[Section]:
-    """What was "auto", if anything was: what it has come to, and what was tried."""
-    words = list(model_selection.words_of(job))
-    if not words:
+def _selection_sections(context: Context) -> Iterator[Section]:
+    """What was "auto", if anything was: what was selected, and the candidates."""
+    sentences = list(model_selection.sentences(context))
+    if not sentences:
         return
-    if not model_selection.is_open(job):
-        yield sections.rules_section(words)
+    if not model_selection.has_candidates(context):
+        yield sections.rules_section(sentences)
         return
-    found, records = model_selection.outcome(job), model_selection.trial_records(job)
-    tried, pairs = [], []
-    for candidate in found.tried:
-        folder = job.stages.root / model_selection.STAGE / candidate.name
+    selection = model_selection.selection(context)
+    records = model_selection.candidate_records(context)
+    candidates, pairs = [], []
+    for candidate in selection.candidates:
+        folder = context.stages.root / model_selection.STAGE / candidate.name
         measured = comparison.read_comparison(folder / "heldout.json")
         if measured is None:
             return
         relit = RelitPairs(
-            job.held_frames,
+            context.held_out,
             folder / "heldout",
-            silhouettes_of_frames(job, "heldout", job.held_frames),
+            silhouettes_of(context, "heldout", context.held_out),
         )
         pairs.append(relit.measured_in(measured))
-        tried.append(
+        candidates.append(
             sections.CandidateRun(
                 _variant(
                     candidate.name,
@@ -235,7 +248,7 @@ def _choices_sections(job: Job) -> Iterator[Section]:
                 unseen=_mean_of(folder / "truth.json"),
             )
         )
-    yield sections.candidate_runs_section(tried, found.taken.name, words, pairs)
+    yield sections.candidate_runs_section(candidates, selection.selected.name, sentences, pairs)
 
 
 def _mean_of(metrics: Path) -> dict[str, float] | None:
@@ -255,22 +268,24 @@ def _variant(
     )
 
 
-def _rate_sections(job: Job) -> Iterator[Section]:
+def _rate_sections(context: Context) -> Iterator[Section]:
     """Quality against size, if the options ask for it."""
-    if not job.options.shows_rate_distortion:
+    if not context.options.shows_rate_distortion:
         return
     yield sections.rate_distortion_section(
-        stored_points(job),
+        stored_points(context),
         "The last row has the numbers of the fitted model as half floats, unfactored and not "
         "packed, as the paper stores them.",
     )
 
 
-def _alignment_sections(job: Job) -> Iterator[Section]:
-    if not job.options.aligns:
+def _alignment_sections(context: Context) -> Iterator[Section]:
+    if not context.options.aligns:
         return
-    stored = job.result("alignment", "alignment.npz")
-    yield sections.alignment_section(stored["history"], stored["margin"][job.seen_texels])
+    stored = results.arrays(context, "alignment", "alignment.npz")
+    yield sections.alignment_section(
+        stored["history"], stored["margin"][results.measured_texels(context)]
+    )
 
 
 def _truth_sections(
@@ -286,11 +301,11 @@ def _truth_sections(
         )
 
 
-def _compression_section(job: Job) -> Section:
-    path = job.stages.root / "compression" / "field.rfld"
+def _compression_section(context: Context) -> Section:
+    path = results.field_file(context)
     parts = describe(open_field(path)).stored_bytes
     rest = path.stat().st_size - sum(parts.values())
-    return sections.compression_section({**parts, "header, names": rest}, raw_bytes(job))
+    return sections.compression_section({**parts, "header, names": rest}, raw_bytes(context))
 
 
 def _stage(record: Any) -> sections.StageRecord:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from reflfield.factorization import Completion
 from reflfield.field.clustered_pca import CompressionOptions
+from reflfield.pipeline import results
 from reflfield.pipeline.alignment import AlignedFrames, aligned_frames, local_frames
 from reflfield.pipeline.completion import arrays_of, completed
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.util.blocks import Blocks
 
 Floats = NDArray[np.float32]
@@ -40,29 +41,31 @@ class Resampled:
     coefficients: Floats
 
 
-def write_resampling(job: Job, folder: Path) -> dict[str, Any]:
-    """Raw samples in the aligned frames on the grids, and what was not observed filled."""
-    found = resampled(job, aligned_frames(job), job.options.compression, job.blocks(folder))
-    arrays: dict[str, Any] = arrays_of(found.completion)
-    np.savez(folder / "resampling.npz", **{**arrays, ALL_COEFFICIENTS: found.coefficients})
+def write_resampling(context: Context, folder: Path) -> dict[str, Any]:
+    """Resample raw samples in the aligned frames, and fill what was not observed."""
+    texels = resampled(
+        context, aligned_frames(context), context.options.compression, context.blocks(folder)
+    )
+    arrays: dict[str, Any] = arrays_of(texels.completion)
+    np.savez(folder / "resampling.npz", **{**arrays, ALL_COEFFICIENTS: texels.coefficients})
     return {
-        "texels that shape the basis": len(found.completion.coefficients),
-        "residual": float(found.completion.residuals[-1]),
+        "texels that shape the basis": len(texels.completion.coefficients),
+        "residual": float(texels.completion.residuals[-1]),
     }
 
 
 def resampled(
-    job: Job, frames: AlignedFrames, options: CompressionOptions, blocks: Blocks
+    context: Context, frames: AlignedFrames, options: CompressionOptions, blocks: Blocks
 ) -> Resampled:
-    """Resample all texels from their raw samples in the given frames, and complete them."""
-    reader = job.base_reader.rotated(local_frames(job, frames.local_from_base))
-    found, coefficients = completed(
+    """Resample all texels from their raw samples in some frames, and complete them."""
+    reader = results.base_reader(context).rotated(local_frames(context, frames.local_from_base))
+    completion, coefficients = completed(
         reader,
-        job.training_texels(options.training_texels),
-        job.seen_texels,
+        results.random_texels(context, options.training_texels),
+        results.measured_texels(context),
         rank=options.rank,
-        seed=job.options.seed,
-        resources=job.resources,
+        seed=context.options.seed,
+        resources=context.resources,
         blocks=blocks,
     )
-    return Resampled(frames, found, coefficients)
+    return Resampled(frames, completion, coefficients)

@@ -1,4 +1,4 @@
-"""Where every photograph, sample and texel of a run has gone."""
+"""Bookkeeping of samples: what became of every photograph, sample and texel of a run."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from reflfield.pipeline import comparison
-from reflfield.pipeline.compared_photographs import frame_sets
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import comparison, results
+from reflfield.pipeline.compared_photographs import compared_photographs
+from reflfield.pipeline.context import Context
 from reflfield.report.sections import CountedItems
 
 
-def accounts_of(job: Job) -> Iterator[CountedItems]:
+def sample_counts(context: Context) -> Iterator[CountedItems]:
     """Count what went into each stage of a finished run, and what became of it.
 
     Totals come from the capture and the texel table, parts from what the stages have
@@ -21,38 +21,41 @@ def accounts_of(job: Job) -> Iterator[CountedItems]:
 
     Parameters
     ----------
-    job : Job
+    context : Context
         With its stages done up to the comparison.
 
     Yields
     ------
     CountedItems
     """
-    counts = {record.name: record.counts for record in job.stages.records}
-    yield _photographs(job, counts["observations"])
-    yield _values(job, counts["observations"])
-    yield _samples(job, counts)
-    yield from _texels(job, counts)
-    yield _frames(job)
+    counts = {record.name: record.counts for record in context.stages.records}
+    yield _photographs(context, counts["observations"])
+    yield _values(context, counts["observations"])
+    yield _samples(context, counts)
+    yield from _texels(context, counts)
+    yield _frames(context)
 
 
-def _photographs(job: Job, projected: dict[str, Any]) -> CountedItems:
+def _photographs(context: Context, projected: dict[str, Any]) -> CountedItems:
     """Photographs of the capture: projected, held out and compared, or neither."""
     return CountedItems(
         "observations",
         "photographs",
-        len(job.capture.photographs),
+        len(context.capture.photographs),
         {
             "projected onto the surface": projected["photographs"],
-            "held out and compared": len(job.held_frames.photographs),
-            "of a held-out view or light, used for neither": len(job.split.aside),
+            "held out and compared": len(context.held_out.photographs),
+            "of a held-out view or light, used for neither": len(context.split.aside),
         },
     )
 
 
-def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> CountedItems:
+def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItems:
     """One sample for each texel and photograph: fitted, unseen, shadowed, below the horizon."""
-    observed, pairs = job.observed, job.observed.pairs.astype(np.float32)
+    observed, pairs = (
+        results.observed(context),
+        results.observed(context).pairs.astype(np.float32),
+    )
     seen = observed.views.astype(np.float32) @ pairs
     shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
     unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
@@ -64,7 +67,7 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> CountedItems:
     return CountedItems(
         "compression",
         "samples",
-        len(job.texels) * len(job.training.photographs),
+        len(results.texels(context)) * len(context.training.photographs),
         {
             "fitted": used,
             "texel not seen by the camera": int(unseen),
@@ -79,13 +82,13 @@ def _samples(job: Job, counts: dict[str, dict[str, Any]]) -> CountedItems:
     )
 
 
-def _values(job: Job, projected: dict[str, Any]) -> CountedItems:
+def _values(context: Context, projected: dict[str, Any]) -> CountedItems:
     """Three values for each photograph and texel that its camera sees: measured or not."""
-    pairs = job.observed.pairs.sum(axis=1)
+    pairs = results.observed(context).pairs.sum(axis=1)
     names = {
         "measured": "measured",
         "saturated": "saturated: left out",
-        "black": "at code 0: taken for what is too dark for the file",
+        "black": "at code 0: counted as too dark for the file",
         "transparent": "under alpha 0: left out",
         "dark": "of a colour that the light has not: left out",
         "unlit": "the light gives nothing there",
@@ -93,15 +96,15 @@ def _values(job: Job, projected: dict[str, Any]) -> CountedItems:
     return CountedItems(
         "observations",
         "values",
-        3 * int(job.view_seen.sum(axis=0) @ pairs),
+        3 * int(results.view_visible(context).sum(axis=0) @ pairs),
         {name: projected[f"values {kind}"] for kind, name in names.items()},
     )
 
 
-def _texels(job: Job, counts: dict[str, dict[str, Any]]) -> Iterator[CountedItems]:
+def _texels(context: Context, counts: dict[str, dict[str, Any]]) -> Iterator[CountedItems]:
     """Texels of the atlas through completion and alignment, if any, and compression."""
-    n = len(job.texels)
-    if job.options.aligns:
+    n = len(results.texels(context))
+    if context.options.aligns:
         yield from _aligned_texels(counts, n)
     fitted = counts["compression"]
     yield CountedItems(
@@ -138,12 +141,12 @@ def _aligned_texels(counts: dict[str, dict[str, Any]], n: int) -> Iterator[Count
     )
 
 
-def _frames(job: Job) -> CountedItems:
+def _frames(context: Context) -> CountedItems:
     """Photographs that are compared, from the metrics that were written."""
     names = {"heldout": "held out", "truth": "unseen and simulated"}
-    sets, parts = frame_sets(job), {}
+    sets, parts = compared_photographs(context), {}
     for name, frames in sets.items():
-        measured = comparison.comparison_of(job, name)
+        measured = comparison.comparison_of(context, name)
         if measured is None:
             parts[f"{names[name]}, not compared"] = len(frames.photographs)
             continue

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from reflfield.capture.capture import Capture
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import silhouettes_at_once
 from reflfield.pipeline.silhouette_store import SILHOUETTES, store_silhouettes
 
@@ -17,20 +17,20 @@ VIEWS_AT_ONCE = 8
 PIXELS_AT_ONCE = 16 << 20
 
 
-def write_silhouettes(job: Job, folder: Path) -> dict[str, Any]:
+def write_silhouettes(context: Context, folder: Path) -> dict[str, Any]:
     """Coverage of every training view, read or made, as 8-bit arrays."""
-    capture = job.training
-    found = job.blocks(folder).map(
+    capture = context.training
+    blocks = context.blocks(folder).map(
         "silhouettes",
         silhouettes_block,
         capture,
         silhouette_runs(capture),
-        at_once=silhouettes_at_once(job),
+        at_once=silhouettes_at_once(context),
     )
-    views = (named for arrays in found for named in arrays.items())
+    views = (named for arrays in blocks for named in arrays.items())
     store_silhouettes(folder / SILHOUETTES, views)
-    given = sum(path is not None for path in capture.silhouettes)
-    return {"views": capture.n_views, "silhouettes given": given}
+    n_given = sum(path is not None for path in capture.silhouettes)
+    return {"views": capture.n_views, "silhouettes given": n_given}
 
 
 def silhouettes_block(capture: Capture, views: range) -> dict[str, Any]:

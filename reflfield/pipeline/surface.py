@@ -20,19 +20,20 @@ from reflfield.fitting.normal_integration import (
 from reflfield.geometry.mesh import Mesh, write_ply
 from reflfield.geometry.silhouette_distance import SignedDistance, signed_distance
 from reflfield.geometry.uv_atlas import Atlas
+from reflfield.pipeline import results
 from reflfield.pipeline.atlas import write_atlas_arrays
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.half_vector_fit import MODEL, HalfVectorFit, fitted_on_hull, write_model
 from reflfield.pipeline.indirect import write_indirect
 from reflfield.pipeline.observations import lost_observations, write_observations
 from reflfield.pipeline.visibility import write_visibility
 
 
-def write_surface(job: Job, folder: Path) -> dict[str, Any]:
+def write_surface(context: Context, folder: Path) -> dict[str, Any]:
     """Fit on the hull, and move the hull so that it has the fitted normals."""
-    fit = HalfVectorFit(job)
+    fit = HalfVectorFit(context)
     found = fitted_on_hull(fit, folder)
-    model, texels = found.model, job.texels
+    model, texels = found.model, results.texels(context)
     normals = model.frames[:, 2].astype(np.float64)
     fitted = FittedNormals(
         positions=texels.position,
@@ -40,10 +41,10 @@ def write_surface(job: Job, folder: Path) -> dict[str, Any]:
         normals=normals,
         confidence=confidence_of(found.information),
     )
-    distances = [_distance(silhouette) for silhouette in job.view_silhouettes]
-    anchors = silhouette_anchors(job.training.cameras, distances, texels.position, normals)
+    distances = [_distance(silhouette) for silhouette in results.silhouettes(context)]
+    anchors = silhouette_anchors(context.training.cameras, distances, texels.position, normals)
     height = integrated_displacements(fitted, fit.graph, anchors)
-    atlas = moved_atlas(job.surface_atlas, texels.position, height[:, None] * fitted.base)
+    atlas = moved_atlas(results.atlas(context), texels.position, height[:, None] * fitted.base)
     write_atlas_arrays(folder / "atlas.npz", atlas)
     write_ply(folder / "surface.ply", welded(atlas)[0])
     write_model(folder / MODEL, model, fit.white)
@@ -75,21 +76,21 @@ def moved_atlas(
     return replace(atlas, positions=moved, normals=mesh.vertex_normals[number])
 
 
-def write_surface_visibility(job: Job, folder: Path) -> dict[str, Any]:
+def write_surface_visibility(context: Context, folder: Path) -> dict[str, Any]:
     """Which camera and which light each texel of the new surface sees."""
-    return write_visibility(job.refined, folder)
+    return write_visibility(context.refined, folder)
 
 
-def write_surface_observations(job: Job, folder: Path) -> dict[str, Any]:
+def write_surface_observations(context: Context, folder: Path) -> dict[str, Any]:
     """Samples of the texels of the new surface."""
-    return write_observations(job.refined, folder)
+    return write_observations(context.refined, folder)
 
 
-def lost_surface_observations(job: Job, folder: Path) -> str:
+def lost_surface_observations(context: Context, folder: Path) -> str:
     """What is wrong with those samples in a store elsewhere; empty if nothing is."""
-    return lost_observations(job.refined, folder)
+    return lost_observations(context.refined, folder)
 
 
-def write_surface_indirect(job: Job, folder: Path) -> dict[str, Any]:
+def write_surface_indirect(context: Context, folder: Path) -> dict[str, Any]:
     """Indirect light on the new surface."""
-    return write_indirect(job.refined, folder)
+    return write_indirect(context.refined, folder)

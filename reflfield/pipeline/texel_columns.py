@@ -67,8 +67,8 @@ class BlockedColumns:
         step = texels_at_once(self.reader, self.block_bytes)
         for first in range(0, len(columns), step):
             part = slice(first, first + step)
-            found, share = self._nodes.read(columns[part])
-            values[part], weights[part] = found.T, share.T
+            nodes, share = self._nodes.read(columns[part])
+            values[part], weights[part] = nodes.T, share.T
         return values.T, weights.T
 
 
@@ -127,15 +127,15 @@ class Resampling:
         return source.read(np.arange(len(texels)))
 
 
-def resampled_halves(context: Resampling, texels: Indices) -> dict[str, Halves]:
+def resampled_halves(resampling: Resampling, texels: Indices) -> dict[str, Halves]:
     """Resampled texels as rows of halves: a block of `half_columns`."""
-    values, weights = context.columns(texels)
-    values = values.T / np.float32(context.reader.domain_unit)
+    values, weights = resampling.columns(texels)
+    values = values.T / np.float32(resampling.reader.domain_unit)
     return {"values": values.astype(np.float16), "weights": weights.T.astype(np.float16)}
 
 
 def half_columns(
-    blocks: Blocks, context: Resampling, texels: Indices, memory: int, folder: Path
+    blocks: Blocks, resampling: Resampling, texels: Indices, memory: int, folder: Path
 ) -> HalfColumns:
     """Resample texels once, for several passes.
 
@@ -143,7 +143,7 @@ def half_columns(
     ----------
     blocks : Blocks
         Who resamples them; what an interrupted run has done is kept.
-    context : Resampling
+    resampling : Resampling
     texels : (n,) int
         Ascending.
     memory : int
@@ -156,14 +156,14 @@ def half_columns(
     HalfColumns
         The same values in both cases.
     """
-    reader, n = context.reader, len(texels)
+    reader, n = resampling.reader, len(texels)
     widths = (reader.n_pairs * 3, reader.n_pairs * reader.weight_channels)
     parts = [texels[i : i + COLUMNS_AT_ONCE] for i in range(0, n, COLUMNS_AT_ONCE)]
-    found = blocks.map("resampling for the basis", resampled_halves, context, parts)
+    halves = blocks.map("resampling for the basis", resampled_halves, resampling, parts)
     fits = n * sum(widths) * 2 <= memory
     kept = [np.zeros((n if fits else 0, width), np.float16) for width in widths]
     paths = (folder / "values", folder / "weights")
-    for i, part in enumerate(found):
+    for i, part in enumerate(halves):
         for array, path, name in zip(kept, paths, ("values", "weights"), strict=True):
             block = part[name]
             if fits:
@@ -175,31 +175,18 @@ def half_columns(
     return HalfColumns(values, weights, (widths[0], n), widths[1], reader.domain_unit)
 
 
-@dataclass(frozen=True, eq=False)
-class Inference:
-    """A completion, and the texels whose coefficients in it are asked for.
-
-    Parameters
-    ----------
-    completion : Completion
-    texels : Resampling
-    """
-
-    completion: Completion
-    texels: Resampling
-
-
-def inferred(context: Inference, texels: Indices) -> dict[str, Floats]:
-    """Coefficients of some texels that did not shape a completion."""
+def inferred(shared: tuple[Completion, Resampling], texels: Indices) -> dict[str, Floats]:
+    """Return coefficients of some texels that did not shape a completion."""
+    completion, resampling = shared
     parts = []
     for some in blocks_of(texels, COLUMNS_AT_ONCE):
         # Row by row, as the arithmetic goes.
-        values, weights = map(np.ascontiguousarray, context.texels.columns(some))
-        found, _ = infer_coefficients(
-            context.completion,
+        values, weights = map(np.ascontiguousarray, resampling.columns(some))
+        coefficients, _ = infer_coefficients(
+            completion,
             values,
             weights=weights,
-            n_channels=3 // context.texels.reader.weight_channels,
+            n_channels=3 // resampling.reader.weight_channels,
         )
-        parts.append(found)
+        parts.append(coefficients)
     return {"coefficients": np.concatenate(parts)}

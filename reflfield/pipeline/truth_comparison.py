@@ -24,7 +24,8 @@ from reflfield.observations.texel_samples import (
     inverse_transform,
     local_directions,
 )
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import results
+from reflfield.pipeline.context import Context
 from reflfield.sphere.hemisphere import softened_cosine
 
 # Texels farther from a true surface point than this many texel spacings see another part.
@@ -51,10 +52,10 @@ class TruthScores:
     problems: tuple[str, ...] = ()
 
 
-def truth_scores(job: Job, field: ReflectanceField) -> TruthScores | None:
+def truth_scores(context: Context, field: ReflectanceField) -> TruthScores | None:
     """All scores against the truth; without what of it is damaged. None without a truth."""
     try:
-        truth = open_truth(job.capture.root)
+        truth = open_truth(context.capture.root)
     except InputError as error:
         return TruthScores(problems=(f"truth: not compared: {error}",))
     if truth is None:
@@ -68,71 +69,81 @@ def truth_scores(job: Job, field: ReflectanceField) -> TruthScores | None:
             problems.append(f"truth: not compared: {error}")
             return None
 
-    hull = None if job.is_plane else score(lambda: hull_score(job, truth))
-    frames, base = score(lambda: frame_scores(job, truth, field)) or (None, None)
-    completion = score(lambda: completion_score(job, truth))
+    hull = None if context.is_plane else score(lambda: hull_score(context, truth))
+    frames, base = score(lambda: frame_scores(context, truth, field)) or (None, None)
+    completion = score(lambda: completion_score(context, truth))
     return TruthScores(hull, frames, base, completion, tuple(problems))
 
 
-def hull_score(job: Job, truth: Truth) -> HullDistance:
+def hull_score(context: Context, truth: Truth) -> HullDistance:
     """Distance of the hull to the true surface, also in voxels of the hull's grid."""
-    details = json.loads((job.stages.root / "hull" / "hull.json").read_text())
-    mesh = job.hull_mesh
+    details = json.loads((context.stages.root / "hull" / "hull.json").read_text())
+    mesh = results.hull_mesh(context)
     return hull_distance(
         (mesh.vertices, mesh.faces), truth.mesh(), voxel=details.get("spacing")
     )
 
 
 def frame_scores(
-    job: Job, truth: Truth, field: ReflectanceField
+    context: Context, truth: Truth, field: ReflectanceField
 ) -> tuple[FrameErrors, FrameErrors] | None:
     """Angles of the recovered and of the base frames to the true shading frames.
 
-    One turn about the normal is free for each target and material; of the base frames, which
-    have no target, for each material.
+    One rotation about the normal is undetermined for each target and material; of the base
+    frames, which have no target, for each material.
     """
-    cameras = [c for c in job.training.cameras if truth.has_view(c.id)]
+    cameras = [c for c in context.training.cameras if truth.has_view(c.id)]
     if not cameras:
         return None
     surface = surface_points(truth.view(c.id, (c.width, c.height)) for c in cameras)
-    seen = job.seen_texels
-    reach = MATCH_SPACINGS * job.texels.spacing
-    position = job.texels.position[seen]
+    seen = results.measured_texels(context)
+    reach = MATCH_SPACINGS * results.texels(context).spacing
+    position = results.texels(context).position[seen]
     target = np.zeros(len(seen), np.int32)
-    if job.options.aligns:
-        target = job.result("alignment", "alignment.npz")["cluster"][seen]
+    if context.options.aligns:
+        target = results.arrays(context, "alignment", "alignment.npz")["cluster"][seen]
     return (
         frame_errors(position, field.local_from_world[seen], surface, reach, target),
-        frame_errors(position, job.texels.local_from_world[seen], surface, reach, 0 * target),
+        frame_errors(
+            position, results.texels(context).local_from_world[seen], surface, reach, 0 * target
+        ),
     )
 
 
-def completion_score(job: Job, truth: Truth) -> CompletionError | None:
+def completion_score(context: Context, truth: Truth) -> CompletionError | None:
     """Error of the completed nodes against true apparent BRDFs, seen and unseen.
 
     At every surface point whose full apparent BRDF the truth holds, the nearest texel's
     completed function is evaluated for all its directions.
     """
     points = truth.samples()
-    if points is None or not job.training.lights_known or not job.options.aligns:
+    known = context.training.lights_known
+    if points is None or not known or not context.options.aligns:
         return None
-    counts, expected = points["samples"].shape[1:3], (job.capture.n_views, job.capture.n_lights)
+    counts, expected = (
+        points["samples"].shape[1:3],
+        (context.capture.n_views, context.capture.n_lights),
+    )
     if counts != expected:
         raise InputError(
             f"{truth.path('abrdf', '')}: samples: expected the capture's {expected[0]} views "
             f"and {expected[1]} lights, received {counts[0]} and {counts[1]}"
         )
-    return _completion_at(job, points)
+    return _completion_at(context, points)
 
 
-def _completion_at(job: Job, points: dict[str, NDArray[Any]]) -> CompletionError | None:
-    seen = job.seen_texels
-    distance, nearest = cKDTree(job.texels.position[seen]).query(points["position"])
-    close = np.flatnonzero(distance < MATCH_SPACINGS * job.texels.spacing)
+def _completion_at(context: Context, points: dict[str, NDArray[Any]]) -> CompletionError | None:
+    seen = results.measured_texels(context)
+    distance, nearest = cKDTree(results.texels(context).position[seen]).query(
+        points["position"]
+    )
+    close = np.flatnonzero(distance < MATCH_SPACINGS * results.texels(context).spacing)
     if not len(close):
         return None
     texels = seen[nearest[close]]
-    completed = completed_samples(job, texels, points["views"][close], points["lights"][close])
+    completed = completed_samples(
+        context, texels, points["views"][close], points["lights"][close]
+    )
     # Shadows are traced when rendering; what a shadowed sample would be is not asked.
     lit = points["light_visible"][close][:, None, :]
     above = (points["views"][close] * points["frame"][close][:, None, 2]).sum(axis=2) > 0
@@ -140,10 +151,10 @@ def _completion_at(job: Job, points: dict[str, NDArray[Any]]) -> CompletionError
     used = np.zeros(asked.shape, bool)
     training = np.ix_(
         np.arange(len(close)),
-        job.split.training_views,
-        job.split.training_lights,
+        context.split.training_views,
+        context.split.training_lights,
     )
-    measured = job.observed
+    measured = results.observed(context)
     used[training] = (
         measured.views[texels][:, :, None]
         & measured.lights[texels][:, None, :]
@@ -153,13 +164,13 @@ def _completion_at(job: Job, points: dict[str, NDArray[Any]]) -> CompletionError
 
 
 def completed_samples(
-    job: Job, texels: NDArray[np.intp], views: NDArray[Any], lights: NDArray[Any]
+    context: Context, texels: NDArray[np.intp], views: NDArray[Any], lights: NDArray[Any]
 ) -> NDArray[np.float32]:
     """Samples of completed texels for directions of the world.
 
     Parameters
     ----------
-    job : Job
+    context : Context
         With its completion stage done.
     texels : (n,) int
     views, lights : (n, k, 3) float
@@ -170,11 +181,11 @@ def completed_samples(
     (n, n_views, n_lights, 3) float32
         1/sr, cosine included, without cast shadows.
     """
-    stored = job.result("completion", "completion.npz")
-    sides, domain = job.sides, job.options.resampling.domain
+    stored = results.arrays(context, "completion", "completion.npz")
+    sides, domain = context.grid_sides, context.options.resampling.domain
     columns = stored["mean"] + stored["coefficients"][texels] @ stored["basis"].T
     nodes = columns.reshape(len(texels), sides[0] ** 2, sides[1] ** 2, 3)
-    frames = job.texels.local_from_world[texels]
+    frames = results.texels(context).local_from_world[texels]
     local = [local_directions(frames, d.astype(np.float32)) for d in (views, lights)]
     at_views, at_lights = (
         interpolation_matrices(direction_taps(d, side), side)

@@ -16,29 +16,30 @@ from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.occlusion import VisibilityOptions, light_visibility, view_visibility
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import TexelTable
-from reflfield.pipeline.context import Job
+from reflfield.pipeline import results
+from reflfield.pipeline.context import Context
 from reflfield.util.dask_cluster import threads_here
 
 # Views, or lights, of one block.
 DIRECTIONS_AT_ONCE = 8
 
 
-def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
+def write_visibility(context: Context, folder: Path) -> dict[str, Any]:
     """Which camera and which light each texel sees."""
-    capture, texels = job.training, job.texels
-    context = Sight(
+    capture, texels = context.training, results.texels(context)
+    shared = VisibilityRays(
         capture,
         texels,
-        job.surface_atlas.mesh,
-        job.options.visibility,
-        [None] * capture.n_views if job.is_plane else covered_pixels(job),
-        job.resources.workers,
+        results.atlas(context).mesh,
+        context.options.visibility,
+        [None] * capture.n_views if context.is_plane else covered_pixels(context),
+        context.resources.workers,
     )
     view_runs, light_runs = runs(capture.n_views), runs(capture.n_lights)
     named = [("views", run) for run in view_runs] + [("lights", run) for run in light_runs]
     # The rays have threads of their own.
-    found = job.blocks(folder).map("visibility", sight_block, context, named, at_once=1)
-    columns = [arrays["seen"] for arrays in found]
+    parts = context.blocks(folder).map("visibility", visibility_block, shared, named, at_once=1)
+    columns = [arrays["seen"] for arrays in parts]
     views = np.concatenate(columns[: len(view_runs)], axis=1)
     lights = np.concatenate(columns[len(view_runs) :], axis=1)
     if not views.any():
@@ -56,8 +57,8 @@ def write_visibility(job: Job, folder: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What all blocks of views and lights share whose visibility is traced.
+class VisibilityRays:
+    """Scene of the rays that find which texels views and lights reach; all blocks share it.
 
     Parameters
     ----------
@@ -87,15 +88,15 @@ class Sight:
         return pixels.reshape(camera.height, camera.width).astype(np.bool_)
 
 
-def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
+def visibility_block(shared: VisibilityRays, block: tuple[str, range]) -> dict[str, Any]:
     """Which texels some views or lights see, (n_texels, k)."""
     kind, some = block
-    scene = RayScene(context.mesh, threads=threads_here(context.threads))
-    capture, texels, options = context.capture, context.texels, context.options
+    scene = RayScene(shared.mesh, threads=threads_here(shared.threads))
+    capture, texels, options = shared.capture, shared.texels, shared.options
     if kind == "views":
         columns = [
             view_visibility(
-                texels, scene, capture.cameras[i], options, silhouette=context.silhouette(i)
+                texels, scene, capture.cameras[i], options, silhouette=shared.silhouette(i)
             )
             for i in some
         ]
@@ -104,10 +105,10 @@ def sight_block(context: Sight, block: tuple[str, range]) -> dict[str, Any]:
     return {"seen": np.stack(columns, axis=1)}
 
 
-def covered_pixels(job: Job) -> list[NDArray[np.uint8]]:
+def covered_pixels(context: Context) -> list[NDArray[np.uint8]]:
     """Pixels of each view that count as covered by the object, eight in a byte."""
-    least = job.options.visibility.coverage
-    return [np.packbits(silhouette >= least) for silhouette in job.view_silhouettes]
+    least = context.options.visibility.coverage
+    return [np.packbits(silhouette >= least) for silhouette in results.silhouettes(context)]
 
 
 def runs(n: int) -> list[range]:

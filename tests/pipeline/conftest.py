@@ -13,6 +13,9 @@ import pytest
 from capture_sim.scene import parse_scene
 from capture_sim.write import write_capture
 from reflfield.cli import main
+from reflfield.options import HoldOut, Resources
+from reflfield.pipeline.cache import StageFolder
+from reflfield.pipeline.context import Context
 
 # Cuts all blocks small when it is imported, which is for processes of its own only: looked
 # into for doctests, it would do so to every test.
@@ -141,6 +144,17 @@ def finished(tmp_path_factory, tiny_capture, tiny_options, subprocess_run):
     )
     assert outcome.status == 0, outcome.err
     return Run(folder, outcome)
+
+
+@pytest.fixture(scope="session")
+def context_of():
+    """Function that makes the context of a run into a folder, or of a finished one."""
+
+    def make(capture, out, options, hold_out=None):
+        held, stages = hold_out or HoldOut(1, 1), StageFolder(out / "stages")
+        return Context(capture, out, options, held, Resources(), stages)
+
+    return make
 
 
 @pytest.fixture

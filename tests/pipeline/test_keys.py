@@ -12,15 +12,16 @@ import pytest
 
 from reflfield.capture.readers import open_capture
 from reflfield.options import HoldOut, Resources, with_tables
-from reflfield.pipeline import stages
+from reflfield.pipeline import stage, stages
 from reflfield.pipeline.cache import StageFolder, StageRecord, stage_key
-from reflfield.pipeline.context import Job
+from reflfield.pipeline.context import Context
+from reflfield.pipeline.hold_out import split_of
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.render.renderer import RenderOptions
 from reflfield.util.file_digests import FileDigests
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
-# All stages but the choices, which nothing leaves open here.
+# All stages but the model selection: no option is "auto" here.
 OPTIONS = with_tables(
     PipelineOptions(),
     {
@@ -32,7 +33,7 @@ OPTIONS = with_tables(
 FIELD = ("indirect", "completion", "alignment", "resampling", "compression")
 LATER = ("maps", "without_alignment", "comparison", "rate_distortion", "report")
 REFLECTANCE = ("observations", *FIELD, *LATER)
-AFTER_HULL = ("atlas", "visibility", "frame_silhouettes", *REFLECTANCE)
+AFTER_HULL = ("atlas", "visibility", "held_out_silhouettes", *REFLECTANCE)
 
 
 class Keys(StageFolder):
@@ -56,18 +57,19 @@ def capture_folder(tmp_path_factory):
 
 def keys(folder, options=OPTIONS, hold_out=None, **resources):
     """Key of every stage that would run."""
-    job = Job(
+    out = folder.parent / "out"
+    context = Context(
         open_capture(folder),
-        folder.parent / "out",
+        out,
         options,
         hold_out or HoldOut(views=1, lights=1),
         Resources(**resources),
-        folders=Keys(folder.parent / "out" / "stages"),
+        Keys(out / "stages"),
     )
-    for stage in stages.ORDER:
-        if stage.wanted(job):
-            stage.run(job)
-    return {record.name: record.key for record in job.stages.records}
+    for each in stages.ORDER:
+        if each.wanted(context):
+            each.run(context)
+    return {record.name: record.key for record in context.stages.records}
 
 
 @pytest.fixture(scope="module")
@@ -118,10 +120,10 @@ def same_but_newer(folder):
             os.utime(path, ns=(10**18, 10**18))
 
 
-def photograph(job_part):
+def photograph(part):
     """File of a photograph that makes the field, or that it is compared with."""
-    job = Job(open_capture(FROZEN), FROZEN, OPTIONS, HoldOut(views=1, lights=1))
-    return Path("photographs") / getattr(job, job_part).photographs[0].path.name
+    split = split_of(capture := open_capture(FROZEN), HoldOut(views=1, lights=1))
+    return Path("photographs") / getattr(split, part)(capture).photographs[0].path.name
 
 
 INPUTS = {
@@ -140,7 +142,7 @@ INPUTS = {
     "a silhouette": (another_silhouette, {"silhouettes", "hull", *AFTER_HULL}),
     "a photograph": (bits(photograph("training")), {*REFLECTANCE}),
     "a held-out photograph": (
-        bits(photograph("held_frames")),
+        bits(photograph("frames")),
         {"comparison", "rate_distortion", "report"},
     ),
     "the capture's name": (
@@ -240,19 +242,21 @@ def test_resources(capture_folder, usual, tmp_path):
     assert few == usual
 
 
-def test_trials_depend_on_no_resource():
-    stage = stages.BY_NAME["choices"]
+def test_candidate_runs_depend_on_no_resource():
+    selection = stages.MODEL_SELECTION
     resources = RenderOptions(workers=3, block_pixels=64)
-    assert stage.options(replace(OPTIONS, relighting=resources)) == stage.options(OPTIONS)
+    assert selection.options(replace(OPTIONS, relighting=resources)) == selection.options(
+        OPTIONS
+    )
     finer = RenderOptions(samples_per_pixel=64)
-    assert stage.options(replace(OPTIONS, relighting=finer)) != stage.options(OPTIONS)
+    assert selection.options(replace(OPTIONS, relighting=finer)) != selection.options(OPTIONS)
 
 
 def test_code(capture_folder, usual, monkeypatch):
     """A stage of code that changed, and those after it, are computed again."""
-    digests = stages.code_digest
+    digests = stage.code_digest
     monkeypatch.setattr(
-        stages,
+        stage,
         "code_digest",
         lambda module: digests(module) + "changed" * (module == "reflfield.pipeline.report"),
     )
@@ -262,26 +266,31 @@ def test_code(capture_folder, usual, monkeypatch):
 # --- files --------------------------------------------------------------------------------
 
 
-def test_photographs_are_hashed_once_and_not_again_by_the_next_run(capture_folder, tmp_path):
+def test_photographs_are_hashed_once_and_not_again_by_the_next_run(
+    capture_folder, tmp_path, context_of
+):
     folder = shutil.copytree(capture_folder, tmp_path / "capture")
     same_but_newer(folder)
     index = tmp_path / "files.json"
     before = FileDigests(index)
-    job = Job(open_capture(folder), tmp_path, OPTIONS, digests=before)
+    context = replace(context_of(open_capture(folder), tmp_path, OPTIONS), digests=before)
     photographs = sorted((folder / "photographs").iterdir())
     for _ in range(2):
-        first = job.digest_of(job.capture, "photographs", "lights")
+        first = context.digest_of(context.capture, "photographs", "lights")
     assert sorted(before.hashed) == photographs
     # Their inodes are as new as this test: the index leaves out what may change unseen.
     assert not json.loads(index.read_text())["files"]
     settle(before)
     after = FileDigests(index)
-    assert replace(job, digests=after).digest_of(job.capture, "photographs", "lights") == first
+    assert (
+        replace(context, digests=after).digest_of(context.capture, "photographs", "lights")
+        == first
+    )
     assert after.hashed == []
     # One that has changed is hashed, and no other.
     bits(f"photographs/{photographs[2].name}")(folder)
     again = FileDigests(index)
-    assert replace(job, digests=again).digest_of(job.capture, "photographs") != first
+    assert replace(context, digests=again).digest_of(context.capture, "photographs") != first
     assert again.hashed == [photographs[2]]
 
 

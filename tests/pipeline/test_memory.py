@@ -11,8 +11,8 @@ from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.observations.image_projection import Projection, project_photographs
-from reflfield.options import HoldOut, Resources, read_toml, with_tables
-from reflfield.pipeline.context import Job
+from reflfield.options import Resources, read_toml, with_tables
+from reflfield.pipeline import results
 from reflfield.pipeline.memory import check_memory, least_memory, within_memory
 from reflfield.pipeline.pipeline_options import PipelineOptions, TextureOptions
 from reflfield.pipeline.texel_columns import (
@@ -28,32 +28,32 @@ GB = 1 << 30
 
 
 @pytest.fixture(scope="module")
-def job(finished, tiny_capture, tiny_options):
+def context(finished, tiny_capture, tiny_options, context_of):
     """The finished run, to read from."""
     options = with_tables(PipelineOptions(), read_toml(tiny_options))
-    return Job(open_capture(tiny_capture), finished.folder, options, HoldOut(1, 1))
+    return context_of(open_capture(tiny_capture), finished.folder, options)
 
 
 class TestColumns:
     @pytest.mark.parametrize("at_once", [1, 7, 100])
-    def test_do_not_depend_on_the_block(self, job, at_once):
-        texels = job.seen_texels[::3][:100]
+    def test_do_not_depend_on_the_block(self, context, at_once):
+        texels = results.measured_texels(context)[::3][:100]
         columns = np.random.default_rng(0).permutation(len(texels))
-        whole = BlockedColumns(job.base_reader, texels, GB).read(columns)
-        tight = BlockedColumns(job.base_reader, texels, 1)
-        assert texels_at_once(job.base_reader, 1) == 1
+        whole = BlockedColumns(results.base_reader(context), texels, GB).read(columns)
+        tight = BlockedColumns(results.base_reader(context), texels, 1)
+        assert texels_at_once(results.base_reader(context), 1) == 1
         parts = [tight.read(part) for part in np.array_split(columns, -(-100 // at_once))]
         for i in range(2):
             joined = np.concatenate([part[i] for part in parts], axis=1)
             np.testing.assert_array_equal(joined, whole[i])
 
-    def test_are_the_same_from_files(self, job, tmp_path):
-        texels = job.seen_texels[:300]
-        context = Resampling(job.base_reader, GB)
+    def test_are_the_same_from_files(self, context, tmp_path):
+        texels = results.measured_texels(context)[:300]
+        shared = Resampling(results.base_reader(context), GB)
         blocks = Blocks(Scheduler(2), tmp_path / "blocks")
         (tmp_path / "held").mkdir()
-        in_memory = half_columns(blocks, context, texels, GB, tmp_path / "held")
-        in_files = half_columns(blocks, context, texels, 0, tmp_path)
+        in_memory = half_columns(blocks, shared, texels, GB, tmp_path / "held")
+        in_files = half_columns(blocks, shared, texels, 0, tmp_path)
         assert list((tmp_path / "held").iterdir()) == []
         n_bytes = 300 * (in_files.shape[0] + in_files.shape[0] // 3) * 2
         assert sum(p.stat().st_size for p in tmp_path.iterdir() if p.is_file()) == n_bytes
@@ -61,24 +61,30 @@ class TestColumns:
         columns = np.array([299, 0, 256, 5])
         for one, other in zip(in_memory.read(columns), in_files.read(columns), strict=True):
             np.testing.assert_array_equal(one, other)
-        exact, _ = context.columns(texels[columns])
+        exact, _ = shared.columns(texels[columns])
         # Halves: 11 bits.
         np.testing.assert_allclose(in_files.read(columns)[0], exact, rtol=2**-11, atol=1e-7)
 
 
-def test_projection_does_not_depend_on_the_budget(job, tmp_path):
+def test_projection_does_not_depend_on_the_budget(context, tmp_path):
     # One photograph at a time instead of many.
-    tight = Projection(job.training, job.texels.position, job.view_seen, tmp_path / "s", 1)
+    tight = Projection(
+        context.training,
+        results.texels(context).position,
+        results.view_visible(context),
+        tmp_path / "s",
+        1,
+    )
     project_photographs(tight, Blocks(Scheduler(2), tmp_path / "blocks"), at_once=2)
     for path in sorted(p for p in (tmp_path / "s").rglob("*") if p.is_file()):
-        ample = job.samples_location / path.relative_to(tmp_path / "s")
+        ample = results.samples_location(context) / path.relative_to(tmp_path / "s")
         assert path.read_bytes() == ample.read_bytes(), path
 
 
-def test_pictures_do_not_depend_on_the_block(job, finished):
+def test_pictures_do_not_depend_on_the_block(context, finished):
     options = RenderOptions(samples_per_pixel=4, workers=2)
     tight = replace(options, block_pixels=64)
-    capture, field = job.capture, open_field(finished.folder / "field.rfld")
+    capture, field = context.capture, open_field(finished.folder / "field.rfld")
     one, other = (
         Renderer(field, o).render(capture.cameras[4], capture.lights[2])
         for o in (options, tight)
@@ -114,31 +120,29 @@ class TestCeiling:
         assert timings["max_memory"] == 4 * GB
         assert 100 << 20 < timings["peak_bytes"] < GB
 
-    def test_estimate_bounds_what_a_small_run_takes(self, job, finished):
-        tight = replace(job, resources=Resources(1, GB))
+    def test_estimate_bounds_what_a_small_run_takes(self, context, finished):
+        tight = replace(context, resources=Resources(1, GB))
         timings = json.loads((finished.folder / "timings.json").read_text())
         assert timings["peak_bytes"] < least_memory(tight) + (128 << 20)
         check_memory(tight)
 
-    def test_estimate_grows_with_texels_and_pixels(self, job):
+    def test_estimate_grows_with_texels_and_pixels(self, context):
         larger = PipelineOptions(texture=TextureOptions(largest=4096))
-        cameras = tuple(replace(c, width=4000, height=3000) for c in job.capture.cameras)
-        big = replace(job.capture, cameras=cameras)
-        assert least_memory(replace(job, options=larger)) > least_memory(job) + GB
+        cameras = tuple(replace(c, width=4000, height=3000) for c in context.capture.cameras)
+        big = replace(context.capture, cameras=cameras)
+        assert least_memory(replace(context, options=larger)) > least_memory(context) + GB
         # A compared frame of 12 Mpixel, 46 bytes a pixel and more; 9 silhouettes, a bit each.
-        assert least_memory(replace(job, capture=big)) > least_memory(job) + 7e8
+        assert least_memory(replace(context, capture=big)) > least_memory(context) + 7e8
 
-    def test_too_low_is_refused(self, job):
+    def test_too_low_is_refused(self, context):
         larger = PipelineOptions(texture=TextureOptions(largest=4096))
-        tight = replace(job, options=larger, resources=Resources(1, GB))
-        with pytest.raises(
-            InputError, match=r"max_memory: expected at least \d.\d GB .* 9 v"
-        ):
+        tight = replace(context, options=larger, resources=Resources(1, GB))
+        with pytest.raises(InputError, match=r"max_memory: expected at least \d.\d GB .* 9 v"):
             check_memory(tight)
 
-    def test_what_is_asked_for_suffices(self, job):
+    def test_what_is_asked_for_suffices(self, context):
         larger = PipelineOptions(texture=TextureOptions(largest=4096))
-        tight = replace(job, options=larger, resources=Resources(1, GB))
+        tight = replace(context, options=larger, resources=Resources(1, GB))
         check_memory(replace(tight, resources=Resources(1, least_memory(tight) * 17 // 16)))
 
     def test_refusal_by_the_command_makes_nothing(self, reflfield, tiny_capture, tmp_path):

@@ -16,23 +16,24 @@ from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.publishing import RESULTS
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
-SETTLED = PipelineOptions(
+SELECTED = PipelineOptions(
     resampling=replace(PipelineOptions().resampling, visibility="kept"),
     compression=replace(PipelineOptions().compression, fit="samples"),
 )
-OTHER_ALIGNMENT = replace(SETTLED, alignment=replace(SETTLED.alignment, enabled=False))
-OTHER_HULL = replace(SETTLED, hull=replace(SETTLED.hull, resolution=99))
+OTHER_ALIGNMENT = replace(SELECTED, alignment=replace(SELECTED.alignment, enabled=False))
+OTHER_HULL = replace(SELECTED, hull=replace(SELECTED.hull, resolution=99))
 FIELD = {"field.rfld", "hull.ply"}
 LATER = {"atlas.glb", "normals.exr", "tangents.exr", "metrics.json", "report/index.html"}
 RECORDS = {"timings.json", "options.toml"}
 
 
 def small(stage):
-    """A stage that writes, in no time, what its options and those before it say."""
+    """Stage that writes, in no time, its options and the keys of those before it."""
 
-    def compute(job, folder):
-        before = {name: job.stages.key(name) for name in stage.after if job.stages.record(name)}
-        text = json.dumps([stage.name, plain(stage.options(job.options)), before])
+    def compute(context, folder):
+        records = [context.stages.record(earlier.name) for earlier in stage.after]
+        before = {record.name: record.key for record in records if record is not None}
+        text = json.dumps([stage.name, plain(stage.options(context.options)), before])
         for name in ("value", *RESULTS.get(stage.name, {})):
             (folder / name).write_text(text)
         return {}
@@ -50,9 +51,8 @@ def run(monkeypatch, capture, tmp_path):
     """Function that runs the pipeline with small stages into a folder."""
     order = tuple(small(stage) for stage in stages.ORDER)
     monkeypatch.setattr(stages, "ORDER", order)
-    monkeypatch.setattr(stages, "BY_NAME", {stage.name: stage for stage in order})
 
-    def pipeline_run(options=SETTLED, **named):
+    def pipeline_run(options=SELECTED, **named):
         return stages.run(capture, tmp_path / "out", options, **named)
 
     return pipeline_run
@@ -65,7 +65,7 @@ def out(tmp_path):
 
 def results(out):
     """Files of the output folder, those that are set apart included."""
-    skipped = ("stages", "trials")
+    skipped = ("stages", "candidates")
     return {
         path.relative_to(out).as_posix(): path.read_text()
         for path in out.rglob("*")
@@ -81,8 +81,8 @@ def test_a_whole_run_publishes_all_and_nothing_is_outdated(run, out):
 def test_unchanged_results_are_left_alone(run, out):
     run()
     before = {name: (out / name).stat().st_mtime_ns for name in FIELD | LATER}
-    job = run()
-    assert all(record.reused for record in job.stages.records)
+    context = run()
+    assert all(record.reused for record in context.stages.records)
     assert {name: (out / name).stat().st_mtime_ns for name in FIELD | LATER} == before
 
 
@@ -93,8 +93,8 @@ def test_unchanged_results_are_left_alone(run, out):
         (OTHER_ALIGNMENT, "alignment", set(), LATER | {"field.rfld"}),
         (OTHER_HULL, "hull", {"hull.ply"}, LATER | {"field.rfld"}),
         (OTHER_HULL, "compression", FIELD, LATER),
-        (SETTLED, "hull", set(), set()),
-        (SETTLED, "compression", set(), set()),
+        (SELECTED, "hull", set(), set()),
+        (SELECTED, "compression", set(), set()),
         # Another option, but not of what was run: field and report are of each other.
         (OTHER_ALIGNMENT, "hull", set(), set()),
     ],
@@ -124,7 +124,7 @@ def test_a_failure_after_the_field_leaves_no_earlier_report_beside_it(run, out, 
     run()
     before = results(out)
 
-    def fails(job, folder):
+    def fails(context, folder):
         raise InputError("frames: damaged")
 
     order = tuple(
@@ -145,7 +145,7 @@ def test_an_earlier_field_stays_until_there_is_another(run, out, monkeypatch):
     run()
     before = results(out)
 
-    def fails(job, folder):
+    def fails(context, folder):
         raise InputError("memory: full")
 
     order = tuple(
@@ -170,8 +170,8 @@ def test_a_damaged_stage_file_never_replaces_the_result(run, out, caplog, name, 
         text = bytearray(path.read_bytes())
         text[len(text) // 2] ^= 16
         path.write_bytes(text if damage == "one bit" else b"")
-    job = run()
-    computed = [record.name for record in job.stages.records if not record.reused]
+    context = run()
+    computed = [record.name for record in context.stages.records if not record.reused]
     assert computed == [name.split("/")[0]]
     assert f"{name}: damaged or gone; the stage" in caplog.text
     assert {n: t for n, t in results(out).items() if n not in RECORDS} == {

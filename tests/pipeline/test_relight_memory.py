@@ -8,7 +8,7 @@ import pytest
 from reflfield.capture.image_writing import write_exr
 from reflfield.field.file import write_field
 from reflfield.options import Resources
-from reflfield.pipeline.memory import check_picture_memory
+from reflfield.pipeline.memory import check_image_memory
 from reflfield.render.renderer import RenderOptions
 from tests.synthetic_fields import baked_field, lambert, sphere_surface
 
@@ -84,13 +84,13 @@ def test_what_would_suffice_does(ball):
     options = RenderOptions(workers=2, samples_per_pixel=4)
     picture = {"pixels": 9000**2, "map_pixels": 8192 * 4096}
     with pytest.raises(Exception, match=r"at least \d+\.\d GB") as refused:
-        check_picture_memory(ball, Resources(2, GB), options, **picture)
+        check_image_memory(ball, Resources(2, GB), options, **picture)
     enough = float(str(refused.value).split("at least ")[1].split(" GB")[0])
     # Blocks grow with the ceiling up to 4096 pixels each.
     blocks = 2 * 4096 * 4096 * 4
-    check_picture_memory(ball, Resources(2, int(enough * GB) + blocks), options, **picture)
+    check_image_memory(ball, Resources(2, int(enough * GB) + blocks), options, **picture)
     with pytest.raises(Exception, match="max_memory"):
-        check_picture_memory(ball, Resources(2, int(0.9 * enough * GB)), options, **picture)
+        check_image_memory(ball, Resources(2, int(0.9 * enough * GB)), options, **picture)
 
 
 def test_a_ceiling_of_a_gigabyte_is_enough_for_small_pictures(reflfield, ball_file, tmp_path):

@@ -20,7 +20,7 @@ from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import STAGES
 
 # The tiny run leaves nothing open.
-RAN = tuple(stage for stage in STAGES if stage != "choices")
+RAN = tuple(stage for stage in STAGES if stage != "model_selection")
 FILES = (
     "field.rfld",
     "hull.ply",
@@ -226,7 +226,7 @@ class TestSecondRun:
         expected = [
             stage
             for stage in RAN[RAN.index(first) : RAN.index(last) + 1]
-            if stage != "frame_silhouettes"
+            if stage != "held_out_silhouettes"
         ]
         assert [stage for stage, reused in states(run_copy).items() if not reused] == expected
 

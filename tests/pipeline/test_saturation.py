@@ -77,8 +77,10 @@ def clipped(exposed, tmp_path_factory):
 def error_of(clipped, exposed, tiny_options, folder):
     """Root mean square of the field's error on an unseen photograph that is not clipped."""
     options = with_tables(PipelineOptions(), tomllib.loads(tiny_options.read_text()))
-    job = run(clipped, folder, options, hold_out=HoldOut(views=1, lights=1), last="compression")
-    frames, unclipped = job.held_frames, open_capture(exposed)
+    context = run(
+        clipped, folder, options, hold_out=HoldOut(views=1, lights=1), last="compression"
+    )
+    frames, unclipped = context.held_out, open_capture(exposed)
     field, squares = open_field(folder / "field.rfld"), []
     for _ in relight_photographs(field, frames, folder / "relit"):
         pass

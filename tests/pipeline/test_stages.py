@@ -43,7 +43,7 @@ def other(tmp_path):
 
 @pytest.fixture
 def folder(other, tmp_path):
-    return StageFolder(tmp_path / "own", also=[other])
+    return StageFolder(tmp_path / "own", others=[other])
 
 
 def test_taken_over_with_a_second_name_for_every_file(folder, other):
@@ -70,7 +70,9 @@ def test_replaced_here_it_stays_there(folder, other):
     folder.run("sum", refused, options=OPTIONS)
     folder.run("sum", write_sum, options={"side": 6})
     shutil.rmtree(folder.root / "sum")
-    StageFolder(folder.root.parent / "third", also=[other]).run("sum", refused, options=OPTIONS)
+    StageFolder(folder.root.parent / "third", others=[other]).run(
+        "sum", refused, options=OPTIONS
+    )
 
 
 @pytest.mark.parametrize("code", [errno.EXDEV, errno.EPERM, errno.EMLINK])
@@ -211,13 +213,13 @@ def test_an_unfinished_stage_is_not_taken_over(folder, other):
 
 
 def test_computed_again_it_is_taken_over_only_if_that_was_just_done(other, tmp_path):
-    stale = StageFolder(tmp_path / "own", {"sum"}, also=[other])
+    stale = StageFolder(tmp_path / "own", {"sum"}, others=[other])
     stale.run("sum", write_sum, options=OPTIONS)
     assert not stale.records[0].reused
     StageFolder(tmp_path / "own").run("sum", refused, options=OPTIONS)
     fresh = StageFolder(tmp_path / "other", {"sum"})
     fresh.run("sum", write_sum, options=OPTIONS)
-    own = StageFolder(tmp_path / "own", {"sum"}, also=[fresh])
+    own = StageFolder(tmp_path / "own", {"sum"}, others=[fresh])
     made = own.run("sum", refused, options=OPTIONS)
     assert (made / "sum.txt").samefile(fresh.root / "sum" / "sum.txt")
     assert not own.records[0].reused

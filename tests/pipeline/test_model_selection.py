@@ -1,4 +1,4 @@
-"""What is left open is decided on the held-out frames, by runs that share what they can."""
+"""Options that are "auto" are selected on held-out photographs, by runs that share stages."""
 
 import json
 import re
@@ -16,12 +16,11 @@ from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.options import HoldOut, merged, parse_settings, read_toml, with_tables
 from reflfield.pipeline import model_selection
-from reflfield.pipeline.context import Job
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import STAGES, run
 
 HELD_OUT = HoldOut(views=1, lights=1)
-OPEN = ("resampling.visibility=auto", "compression.fit=auto")
+AUTO = ("resampling.visibility=auto", "compression.fit=auto")
 # Nothing besides that takes time.
 SHORT = (
     "comparison.without_alignment=false",
@@ -29,8 +28,8 @@ SHORT = (
     "alignment.enabled=false",
     "atlas.resolution=48",
 )
-# Runs the command; the process is killed in the comparison of the second trial.
-KILLED_IN_A_TRIAL = """
+# Runs the command; the process is killed in the comparison of the second candidate.
+KILLED_IN_A_CANDIDATE_RUN = """
 import os, signal
 import reflfield.cli as cli
 from reflfield.pipeline import comparison
@@ -38,7 +37,7 @@ from reflfield.pipeline import comparison
 compare, done = comparison.compare_with_photographs, []
 
 def killed(*arguments):
-    if len(done) == 2:  # held-out and unseen frames of the first
+    if len(done) == 2:  # held-out and unseen photographs of the first
         os.kill(os.getpid(), signal.SIGKILL)
     done.append(arguments)
     return compare(*arguments)
@@ -56,27 +55,27 @@ def options_of(path, *settings):
 
 
 @pytest.fixture(scope="module")
-def run_open(tiny_capture, tiny_options):
+def run_auto(tiny_capture, tiny_options):
     """Function that runs the tiny capture with settings, in this process."""
 
-    def open_run(out, *settings, capture=tiny_capture, hold_out=HELD_OUT, **rest):
+    def auto_run(out, *settings, capture=tiny_capture, hold_out=HELD_OUT, **rest):
         options = options_of(tiny_options, *settings)
         return run(open_capture(capture), out, options, hold_out=hold_out, **rest)
 
-    return open_run
+    return auto_run
 
 
 @pytest.fixture(scope="module")
-def tried(run_open, tmp_path_factory):
-    """Folder of a finished run with both choices open. Read only: copy it to change it."""
-    out = tmp_path_factory.mktemp("tried") / "out"
-    run_open(out, *OPEN)
+def selected_run(run_auto, tmp_path_factory):
+    """Folder of a finished run with both options "auto". Read only: copy it to change it."""
+    out = tmp_path_factory.mktemp("selected_run") / "out"
+    run_auto(out, *AUTO)
     return out
 
 
 @pytest.fixture
-def tried_copy(tried, tmp_path):
-    return shutil.copytree(tried, tmp_path / "out")
+def selected_copy(selected_run, tmp_path):
+    return shutil.copytree(selected_run, tmp_path / "out")
 
 
 def records(folder):
@@ -103,29 +102,41 @@ def stamps(folder):
     }
 
 
-class TestWhatATrialLeaves:
-    def test_what_was_taken_follows_from_what_was_measured(self, tried):
-        psnr = {path.parent.name: heldout_psnr(path) for path in tried.glob("trials/*/stages")}
+class TestWhatACandidateRunLeaves:
+    def test_selection_follows_from_what_was_measured(self, selected_run):
+        psnr = {
+            path.parent.name: heldout_psnr(path)
+            for path in selected_run.glob("candidates/*/stages")
+        }
         assert sorted(psnr) == sorted(NAMES)
         assert len(set(psnr.values())) == 4
-        made = records(tried)["choices"]["counts"]
+        made = records(selected_run)["model_selection"]["counts"]
         # One frame: a lead of more than one dB counts.
         expected = NAMES[0]
         for name in NAMES[1:]:
             expected = name if psnr[name] > psnr[expected] + 1.0 else expected
-        assert made["taken"] == expected
+        assert made["selected"] == expected
         assert made["heldout PSNR, dB"] == psnr
         # Of the run itself, and of what it publishes.
-        assert heldout_psnr(tried / "stages") == psnr[expected]
-        best = tried / "trials" / made["taken"] / "stages" / "compression" / "field.rfld"
-        assert (tried / "field.rfld").read_bytes() == best.read_bytes()
+        assert heldout_psnr(selected_run / "stages") == psnr[expected]
+        best = (
+            selected_run
+            / "candidates"
+            / made["selected"]
+            / "stages"
+            / "compression"
+            / "field.rfld"
+        )
+        assert (selected_run / "field.rfld").read_bytes() == best.read_bytes()
 
-    def test_all_are_in_the_report_with_what_they_measured(self, tried):
-        page = (tried / "report" / "index.html").read_text()
+    def test_all_are_in_the_report_with_what_they_measured(self, selected_run):
+        page = (selected_run / "report" / "index.html").read_text()
         section = page[page.index("<h2>Model selection</h2>") :].split("</section>")[0]
         for name in NAMES:
             metrics = json.loads(
-                (tried / "stages" / "choices" / name / "heldout.json").read_text()
+                (
+                    selected_run / "stages" / "model_selection" / name / "heldout.json"
+                ).read_text()
             )["mean"]
             row = re.search(rf"<tr[^>]*><td>{name}</td>.*?</tr>", section).group()
             assert f"{metrics['psnr_ldr']:.2f}" in row
@@ -133,11 +144,11 @@ class TestWhatATrialLeaves:
             assert f"{metrics['flip']:.4f}" in row
             assert f'alt="{name}"' in section
             assert f'alt="FLIP error {name}"' in section
-        taken = records(tried)["choices"]["counts"]["taken"]
+        taken = records(selected_run)["model_selection"]["counts"]["selected"]
         assert f'<tr class="emphasised"><td>{taken}</td>' in section
         assert "unseen views and lights, which had no part in the selection" in section
 
-    def test_stages_before_what_is_open_are_shared(self, tried):
+    def test_stages_before_what_is_auto_are_shared(self, selected_run):
         for stage, file, n_made in (
             ("atlas", "atlas.npz", 1),
             ("observations", "samples/zarr.json", 1),
@@ -145,146 +156,155 @@ class TestWhatATrialLeaves:
             ("resampling", "resampling.npz", 2),
             ("compression", "field.rfld", 4),
         ):
-            roots = [tried / "stages", *tried.glob("trials/*/stages")]
+            roots = [selected_run / "stages", *selected_run.glob("candidates/*/stages")]
             inodes = {(root / stage / file).stat().st_ino for root in roots}
             assert len(inodes) == n_made, stage
 
-    def test_time_counts_every_stage_once(self, tried):
+    def test_time_counts_every_stage_once(self, selected_run):
         found = {}
-        for root in (tried / "stages", *tried.glob("trials/*/stages")):
+        for root in (selected_run / "stages", *selected_run.glob("candidates/*/stages")):
             for path in root.glob("*/stage.json"):
                 record = json.loads(path.read_text())
-                if record["name"] != "choices":
+                if record["name"] != "model_selection":
                     found[record["name"], record["key"]] = record["seconds"]
         # The report's own time is known when it is done.
-        timings = json.loads((tried / "timings.json").read_text())
+        timings = json.loads((selected_run / "timings.json").read_text())
         assert timings["seconds"] == pytest.approx(sum(found.values()), rel=1e-9)
-        # Before what is open, for each visibility (and what its shadows show, if they are
+        # Before what is "auto", for each visibility (and what its shadows show, if they are
         # traced), for each fit in it, the maps and the report.
         assert len(found) == 6 + 2 * 3 + 1 + 4 * 2 + 2
 
-    def test_options_are_as_asked_with_what_was_taken_above(self, tried):
-        text = (tried / "options.toml").read_text()
+    def test_options_are_as_asked_with_the_selection_above(self, selected_run):
+        text = (selected_run / "options.toml").read_text()
         notes = [line for line in text.splitlines() if line.startswith("# ")]
-        shadows, fit = records(tried)["choices"]["counts"]["taken"].split("-")
-        assert f'resampling.visibility = "auto" took "{shadows}"' in notes[0]
-        assert f'compression.fit = "auto" took "{fit}"' in notes[1]
-        psnr = records(tried)["choices"]["counts"]["heldout PSNR, dB"]
+        shadows, fit = records(selected_run)["model_selection"]["counts"]["selected"].split("-")
+        assert f'resampling.visibility = "auto" selected "{shadows}"' in notes[0]
+        assert f'compression.fit = "auto" selected "{fit}"' in notes[1]
+        psnr = records(selected_run)["model_selection"]["counts"]["heldout PSNR, dB"]
         in_doubt = psnr[f"{shadows}-{fit}"] < max(psnr.values())
-        assert [note.endswith("by chance.") for note in notes] == [in_doubt, in_doubt]
-        used = with_tables(PipelineOptions(), read_toml(tried / "options.toml"))
+        assert [note.endswith("within chance.") for note in notes] == [in_doubt, in_doubt]
+        used = with_tables(PipelineOptions(), read_toml(selected_run / "options.toml"))
         assert (used.resampling.visibility, used.compression.fit) == ("auto", "auto")
 
 
 class TestSecondRun:
-    def test_skips_everything_also_without_the_trials(self, tried_copy, run_open):
-        shutil.rmtree(tried_copy / "trials")
-        run_open(tried_copy, *OPEN)
-        assert computed_here(tried_copy) == []
-        assert not (tried_copy / "trials").exists()
+    def test_skips_everything_also_without_the_candidate_runs(self, selected_copy, run_auto):
+        shutil.rmtree(selected_copy / "candidates")
+        run_auto(selected_copy, *AUTO)
+        assert computed_here(selected_copy) == []
+        assert not (selected_copy / "candidates").exists()
 
-    def test_asking_for_what_was_taken_makes_the_same_field(self, tried_copy, run_open):
-        shadows, fit = records(tried_copy)["choices"]["counts"]["taken"].split("-")
+    def test_asking_for_what_was_selected_makes_the_same_field(self, selected_copy, run_auto):
+        shadows, fit = records(selected_copy)["model_selection"]["counts"]["selected"].split(
+            "-"
+        )
         asked = (f"resampling.visibility={shadows}", f"compression.fit={fit}")
-        run_open(tried_copy, *asked, last="comparison")
-        assert computed_here(tried_copy) == []
+        run_auto(selected_copy, *asked, last="comparison")
+        assert computed_here(selected_copy) == []
 
-    def test_accounts_add_up_with_shadows_the_other_way(self, tried_copy, run_open):
-        taken = records(tried_copy)["choices"]["counts"]["taken"]
+    def test_accounts_add_up_with_shadows_the_other_way(self, selected_copy, run_auto):
+        taken = records(selected_copy)["model_selection"]["counts"]["selected"]
         other = "kept" if taken.startswith("factored") else "factored"
-        run_open(tried_copy, f"resampling.visibility={other}", "compression.fit=grid")
-        page = (tried_copy / "report" / "index.html").read_text()
+        run_auto(selected_copy, f"resampling.visibility={other}", "compression.fit=grid")
+        page = (selected_copy / "report" / "index.html").read_text()
         assert "not accounted for." not in page
 
-    def test_from_the_choices_computes_the_trials_again(self, tried_copy, run_open):
-        before = (tried_copy / "field.rfld").read_bytes()
-        run_open(tried_copy, *OPEN, first="choices", last="comparison")
-        after = STAGES[STAGES.index("choices") : STAGES.index("without_alignment")]
-        if records(tried_copy)["choices"]["counts"]["taken"].startswith("kept"):
+    def test_from_model_selection_computes_the_candidates_again(self, selected_copy, run_auto):
+        before = (selected_copy / "field.rfld").read_bytes()
+        run_auto(selected_copy, *AUTO, first="model_selection", last="comparison")
+        after = STAGES[STAGES.index("model_selection") : STAGES.index("without_alignment")]
+        if records(selected_copy)["model_selection"]["counts"]["selected"].startswith("kept"):
             after = [stage for stage in after if stage != "indirect"]
-        assert computed_here(tried_copy) == [*after, "comparison"]
-        assert (tried_copy / "field.rfld").read_bytes() == before
-        roots = [tried_copy / "stages", *tried_copy.glob("trials/*/stages")]
+        assert computed_here(selected_copy) == [*after, "comparison"]
+        assert (selected_copy / "field.rfld").read_bytes() == before
+        roots = [selected_copy / "stages", *selected_copy.glob("candidates/*/stages")]
         made = {(root / "completion" / "completion.npz").stat().st_ino for root in roots}
         assert len(made) == 2
 
-    def test_from_a_later_stage_keeps_the_choice(self, tried_copy, run_open):
-        before = stamps(tried_copy / "trials")
-        run_open(tried_copy, *OPEN, first="compression", last="compression")
-        assert computed_here(tried_copy) == ["compression"]
-        assert stamps(tried_copy / "trials") == before
+    def test_from_a_later_stage_keeps_the_selection(self, selected_copy, run_auto):
+        before = stamps(selected_copy / "candidates")
+        run_auto(selected_copy, *AUTO, first="compression", last="compression")
+        assert computed_here(selected_copy) == ["compression"]
+        assert stamps(selected_copy / "candidates") == before
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs a system with SIGKILL")
-def test_killed_in_a_trial_it_goes_on_there(
-    tried, tiny_capture, tiny_options, subprocess_run, run_open, tmp_path
+def test_killed_in_a_candidate_run_it_goes_on_there(
+    selected_run, tiny_capture, tiny_options, subprocess_run, run_auto, tmp_path
 ):
     out = tmp_path / "out"
-    settings = [word for setting in (*SHORT, *OPEN) for word in ("--set", setting)]
+    settings = [word for setting in (*SHORT, *AUTO) for word in ("--set", setting)]
     words = ("run", tiny_capture, "-o", out, "--config", tiny_options, *settings)
-    killed = subprocess_run("-c", KILLED_IN_A_TRIAL, *words, "--hold-out", "views=1,lights=1")
+    killed = subprocess_run(
+        "-c", KILLED_IN_A_CANDIDATE_RUN, *words, "--hold-out", "views=1,lights=1"
+    )
     assert killed.status == -signal.SIGKILL, killed.err
     left = stamps(out)
     assert sorted(n.split("/")[1] for n in left if "/comparison/" in n) == ["factored-grid"]
-    assert any(name.startswith("trials/factored-samples/stages/compression/") for name in left)
-    run_open(out, *OPEN)
+    assert any(
+        name.startswith("candidates/factored-samples/stages/compression/") for name in left
+    )
+    run_auto(out, *AUTO)
     now = stamps(out)
     assert {name: now[name] for name in left} == left
     assert [path for path in out.rglob("*") if "partial" in path.name] == []
     for name in ("field.rfld", "metrics.json", "stages/choices/choices.json"):
-        assert (out / name).read_bytes() == (tried / name).read_bytes(), name
+        assert (out / name).read_bytes() == (selected_run / name).read_bytes(), name
 
 
-def test_no_trial_before_it_matters(tried_copy, run_open):
-    shutil.rmtree(tried_copy / "trials")
-    shutil.rmtree(tried_copy / "stages" / "choices")
-    run_open(tried_copy, *OPEN, last="observations")
-    run_open(
-        tried_copy, "resampling.visibility=kept", "compression.fit=auto", last="resampling"
+def test_no_candidate_run_before_it_matters(selected_copy, run_auto):
+    shutil.rmtree(selected_copy / "candidates")
+    shutil.rmtree(selected_copy / "stages" / "model_selection")
+    run_auto(selected_copy, *AUTO, last="observations")
+    run_auto(
+        selected_copy, "resampling.visibility=kept", "compression.fit=auto", last="resampling"
     )
-    assert not (tried_copy / "trials").exists()
-    assert "took" not in (tried_copy / "options.toml").read_text()
+    assert not (selected_copy / "candidates").exists()
+    assert "selected" not in (selected_copy / "options.toml").read_text()
 
 
-def test_without_frames_the_number_of_samples_decides_and_says_so(run_open, tmp_path):
-    kept = ("resampling.visibility=kept", OPEN[1])
-    job = run_open(tmp_path, *kept, hold_out=HoldOut(), last="compression")
-    assert job.options.compression.fit == "samples"
+def test_without_photographs_the_number_of_samples_decides_and_says_so(run_auto, tmp_path):
+    kept = ("resampling.visibility=kept", AUTO[1])
+    context = run_auto(tmp_path, *kept, hold_out=HoldOut(), last="compression")
+    assert context.options.compression.fit == "samples"
     assert open_field(tmp_path / "field.rfld").metadata["options"]["compression"]["fit"] == (
         "samples"
     )
     lines = (tmp_path / "options.toml").read_text().splitlines()
-    (note,) = [line for line in lines if line.startswith("# ") and "took" in line]
-    assert '"auto" took "samples": no frames are held out' in note
-    assert not (tmp_path / "trials").exists()
+    (note,) = [line for line in lines if line.startswith("# ") and "selected" in line]
+    assert '"auto" selected "samples": no photographs are held out' in note
+    assert not (tmp_path / "candidates").exists()
 
 
-def test_photographs_held_out_one_by_one_decide_too(run_open, tmp_path, tiny_capture):
-    kept = ("resampling.visibility=kept", OPEN[1])
+def test_photographs_held_out_one_by_one_decide_too(run_auto, tmp_path, tiny_capture):
+    kept = ("resampling.visibility=kept", AUTO[1])
     held = HoldOut(photographs=3)
-    job = run_open(tmp_path, *kept, hold_out=held, last="compression")
+    context = run_auto(tmp_path, *kept, hold_out=held, last="compression")
     psnr = {}
     for name in ("samples", "grid"):
-        compared = tmp_path / "stages" / "choices" / name / "heldout.json"
+        compared = tmp_path / "stages" / "model_selection" / name / "heldout.json"
         frames = json.loads(compared.read_text())["frames"]
-        assert [f["name"] for f in frames] == [p.name for p in job.held_frames.photographs]
+        assert [f["name"] for f in frames] == [p.name for p in context.held_out.photographs]
         psnr[name] = [frame["psnr_ldr"] for frame in frames]
         assert len(psnr[name]) == 3
     # None of the three has made any of the fields: 57 of 60 have.
-    used = {p.path for p in job.training.photographs}
+    used = {p.path for p in context.training.photographs}
     assert len(used) == 57
-    assert used.isdisjoint(p.path for p in job.held_frames.photographs)
-    first = model_selection.candidates(replace(job, options=job.asked_options))[0].fit
+    assert used.isdisjoint(p.path for p in context.held_out.photographs)
+    first = model_selection.candidates(replace(context, options=context.asked_options))[0].fit
     second = "grid" if first == "samples" else "samples"
     ordered = {name: psnr[name] for name in (first, second)}
-    assert job.options.compression.fit == model_selection.clearly_best(ordered)
+    assert context.options.compression.fit == model_selection.clearly_best(ordered)
 
 
-def test_without_frames_to_compare_on_it_is_refused(run_tiny, tmp_path, tiny_capture):
+def test_without_photographs_to_compare_on_it_is_refused(run_tiny, tmp_path, tiny_capture):
     words = ("--set", "resampling.visibility=auto", "--hold-out", "views=0")
     outcome = run_tiny(tmp_path / "out", *words)
     assert outcome.status == 2
-    assert "resampling.visibility: 'auto' expected frames to compare on" in outcome.err
+    assert (
+        "resampling.visibility: 'auto' expected held-out photographs to compare with"
+        in outcome.err
+    )
     assert "--hold-out views=K,lights=K" in outcome.err
     assert not (tmp_path / "out" / "stages" / "hull").exists()
 
@@ -297,61 +317,65 @@ def test_unknown_visibility_is_refused(run_tiny, tmp_path):
 
 class TestCandidates:
     @pytest.fixture
-    def job(self, tried, tiny_capture, tiny_options):
-        """A job with both choices open whose texels are known."""
-        options = options_of(tiny_options, *OPEN)
-        return Job(open_capture(tiny_capture), tried, options, HELD_OUT)
+    def context(self, selected_run, tiny_capture, tiny_options, context_of):
+        """Context with both options "auto" whose texels are known."""
+        options = options_of(tiny_options, *AUTO)
+        return context_of(open_capture(tiny_capture), selected_run, options, HELD_OUT)
 
-    def names(self, job):
-        return [candidate.name for candidate in model_selection.candidates(job)]
+    def names(self, context):
+        return [candidate.name for candidate in model_selection.candidates(context)]
 
-    def with_components(self, job, n_components):
-        compression = replace(job.options.compression, n_components=n_components)
-        return replace(job, options=replace(job.options, compression=compression))
+    def with_components(self, context, n_components):
+        compression = replace(context.options.compression, n_components=n_components)
+        return replace(context, options=replace(context.options, compression=compression))
 
-    def test_what_the_samples_speak_for_comes_first(self, job):
-        assert self.names(job) == NAMES
-        assert self.names(self.with_components(job, 4)) == [
+    def test_what_the_samples_speak_for_comes_first(self, context):
+        assert self.names(context) == NAMES
+        assert self.names(self.with_components(context, 4)) == [
             "factored-grid",
             "factored-samples",
             "kept-grid",
             "kept-samples",
         ]
 
-    def test_fewer_samples_than_coefficients_are_not_fitted_to(self, job, tiny_options):
-        assert [c.fit for c in model_selection.candidates(self.with_components(job, 50))] == [
+    def test_fewer_samples_than_coefficients_are_not_fitted_to(self, context, tiny_options):
+        assert [
+            c.fit for c in model_selection.candidates(self.with_components(context, 50))
+        ] == [
             "grid",
             "grid",
         ]
-        fit = options_of(tiny_options, OPEN[1], "compression.n_components=50")
-        alone = model_selection.decided(replace(job, options=fit))
+        fit = options_of(tiny_options, AUTO[1], "compression.n_components=50")
+        alone = model_selection.with_selection(replace(context, options=fit))
         assert alone.options.compression.fit == "grid"
-        (words,) = model_selection.words_of(alone)
-        assert '"auto" took "grid": 5 samples per texel are fewer than coefficients.' in words
+        (words,) = model_selection.sentences(alone)
+        assert (
+            '"auto" selected "grid": 5 samples per texel are fewer than coefficients.' in words
+        )
 
-    def test_one_choice_has_the_names_of_its_own(self, job, tiny_options):
-        fit = replace(job, options=options_of(tiny_options, OPEN[1]))
+    def test_one_option_names_its_own_values(self, context, tiny_options):
+        fit = replace(context, options=options_of(tiny_options, AUTO[1]))
         assert self.names(fit) == ["grid", "samples"]
-        shadows = replace(job, options=options_of(tiny_options, OPEN[0]))
+        shadows = replace(context, options=options_of(tiny_options, AUTO[0]))
         assert self.names(shadows) == ["factored", "kept"]
 
-    def test_dense_samples_are_not_fitted_to(self, job, monkeypatch):
+    def test_dense_samples_are_not_fitted_to(self, context, monkeypatch):
         monkeypatch.setattr(model_selection, "MOST_SAMPLES", 1)
         monkeypatch.setattr("reflfield.field.clustered_pca.MOST_SAMPLES", 1)
-        assert [c.fit for c in model_selection.candidates(job)] == ["grid", "grid"]
-        assert self.names(job) == ["factored", "kept"]
+        assert [c.fit for c in model_selection.candidates(context)] == ["grid", "grid"]
+        assert self.names(context) == ["factored", "kept"]
 
-    def test_shadows_that_cannot_be_traced_are_kept_without_a_trial(self, job, tiny_options):
-        flat = replace(job.capture, base_geometry=PLANE)
-        options = options_of(tiny_options, OPEN[0])
-        plane = replace(job, capture=flat, options=options, hold_out=HoldOut())
-        model_selection.check_choices(plane)
-        assert not model_selection.is_open(plane)
-        assert model_selection.decided(plane).options.resampling.visibility == "kept"
+    def test_shadows_that_cannot_be_traced_are_kept_without_a_run(self, context, tiny_options):
+        flat = replace(context.capture, base_geometry=PLANE)
+        options = options_of(tiny_options, AUTO[0])
+        plane = replace(context, capture=flat, options=options, hold_out=HoldOut())
+        model_selection.check_selectable(plane)
+        assert not model_selection.has_candidates(plane)
+        assert model_selection.with_selection(plane).options.resampling.visibility == "kept"
 
-    def test_open_shadows_are_not_taken_for_either(self, job):
+    def test_auto_shadows_count_as_neither(self, context):
         with pytest.raises(InputError, match=r"resampling.visibility.*'auto'"):
-            _ = job.visibility_kind
+            _ = context.visibility_kind
 
 
 @pytest.mark.parametrize(
@@ -412,7 +436,7 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("better", OBJECTS)
-def test_shadows_are_treated_as_the_object_needs(better, run_open, tmp_path):
+def test_shadows_are_treated_as_the_object_needs(better, run_auto, tmp_path):
     shape, height, n_lights, cameras = OBJECTS[better]
     target = {"target": [0.0, 0.0, height]}
     scene = {
@@ -424,18 +448,18 @@ def test_shadows_are_treated_as_the_object_needs(better, run_open, tmp_path):
     }
     capture = write_capture(parse_scene(scene), tmp_path / "capture")
     grids = ("resampling.view_side=0", "resampling.light_side=0", "hull.resolution=48")
-    job = run_open(
+    context = run_auto(
         tmp_path / "out",
-        OPEN[0],
+        AUTO[0],
         *grids,
         capture=capture,
         hold_out=HoldOut(views=1, lights=n_lights),
         last="compression",
     )
-    print(job.stages.record("choices").counts["heldout PSNR, dB"])
-    assert job.options.resampling.visibility == better
+    print(context.stages.record("model_selection").counts["heldout PSNR, dB"])
+    assert context.options.resampling.visibility == better
     assert open_field(tmp_path / "out" / "field.rfld").visibility == better
-    psnr = job.stages.record("choices").counts["heldout PSNR, dB"]
+    psnr = context.stages.record("model_selection").counts["heldout PSNR, dB"]
     other = next(name for name in psnr if name != better)
     # Seen: .9 dB for the amphora (2.4 before values beyond those seen were bounded, which
     # brings kept shadows 1.7 dB), 3.5 dB for the ball.

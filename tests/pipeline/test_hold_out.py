@@ -11,8 +11,8 @@ from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.options import HoldOut, parse_hold_out
 from reflfield.pipeline.hold_out import (
-    held_out_words,
-    left_out_words,
+    held_out_sentence,
+    left_out_sentences,
     split_of,
     spread_photographs,
 )
@@ -62,7 +62,7 @@ class TestDense:
         split = split_of(capture, HoldOut(views=2, lights=2))
         assert pairs_of(capture, split.compared) == [(3, 3), (3, 9), (10, 3), (10, 9)]
         assert (len(split.trained), len(split.aside), split.kind) == (120, 44, "both")
-        assert held_out_words(split) == (
+        assert held_out_sentence(split) == (
             "4 photographs of 2 held-out views under 2 held-out lights are compared; "
             "44 others of those are used for neither; 120 of 168 make the field"
         )
@@ -125,9 +125,9 @@ class TestOneLightForEachView:
         split = split_of(moved, HoldOut(views=2, lights=2))
         assert (len(split.compared), len(split.trained), len(split.aside)) == (4, 36, 0)
         assert split.kind == "either"
-        assert "none of them of both" in held_out_words(split)
+        assert "none of them of both" in held_out_sentence(split)
         assert split.training(moved).n_views == 36
-        (words,) = left_out_words(moved, split)
+        (words,) = left_out_sentences(moved, split)
         assert words.startswith("2 cameras of which all photographs are held out")
 
     def test_photographs(self):
@@ -144,7 +144,7 @@ class TestGaps:
         split = split_of(capture, HoldOut(views=1))
         assert split.views.tolist() == [2]
         assert split.training_views.tolist() == [0, 3]
-        assert list(left_out_words(capture, split)) == [
+        assert list(left_out_sentences(capture, split)) == [
             "1 camera without a photograph and a silhouette, left out: 'v1'"
         ]
 
@@ -154,11 +154,11 @@ class TestGaps:
         split = split_of(capture, HoldOut())
         assert split.training_views.tolist() == [0, 1, 2, 3]
         assert split.training_lights.tolist() == [0, 2]
-        assert list(left_out_words(capture, split)) == [
+        assert list(left_out_sentences(capture, split)) == [
             "1 camera without a photograph, of which only the silhouette is used: 'v1'",
             "1 light without a photograph, left out: 'l1'",
         ]
-        assert held_out_words(split) == "no photograph is held out; 6 of 6 make the field"
+        assert held_out_sentence(split) == "no photograph is held out; 6 of 6 make the field"
 
 
 class TestRefused:
