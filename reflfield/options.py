@@ -26,7 +26,10 @@ log = logging.getLogger(__name__)
 Options = TypeVar("Options")
 # Options that were renamed, by their whole names, old -> new. Old names are accepted, with one
 # line of warning, until the next minor version.
-RENAMED_OPTIONS: dict[str, str] = {}
+RENAMED_OPTIONS = {
+    "compression.coarseness": "compression.relative_step",
+    "compression.samples.fineness": "compression.samples.grid_refinement",
+}
 # A configuration file is written by hand: anything larger is another file.
 LARGEST_FILE = 1 << 20
 # Keys of very many parts take time and memory that grow with the square of their number.

@@ -39,8 +39,6 @@ ALLOWED = {
     ("reflfield/pipeline/cache.py", "blocks_repeated"): "written into the record of a stage",
     ("reflfield/observations/store.py", "_end_thread_of_zarr"): "run at the process's end",
 }
-# Known finds, to be removed: path and name. May vanish without notice, never grow.
-TO_BE_REMOVED = {("reflfield/alignment/scattered.py", "refine_scattered")}
 # Attributes and methods that are promised to users: `test_public_api` keeps the list.
 PROMISED = {
     line.split("(")[0].partition(".")[2]
@@ -80,7 +78,7 @@ def imported_from(roots, graph):
 def test_every_name_is_mentioned_by_other_code():
     # One package at a time: names of one do not excuse the other's.
     unused = {item for package in PACKAGES for item in unmentioned(ROOT, [package])}
-    assert sorted(unused - set(ALLOWED) - TO_BE_REMOVED) == []
+    assert sorted(unused - set(ALLOWED)) == []
     assert sorted(set(ALLOWED) - unused) == [], "no longer needed in the list"
 
 

@@ -67,13 +67,13 @@ class CompressionOptions:
         Texels that shape the completion's basis.
     samples : SampleFitOptions
     size : int
-        Bytes that the file may have, 0: as many as `coarseness` gives. Clusters, components
+        Bytes that the file may have, 0: as many as `relative_step` gives. Clusters, components
         and quantisation are then chosen by the error that they leave; see
         `field.step_search`.
     psnr : float
         LDR PSNR, dB, that the field is to have on the samples that it is made of, 0: as it
         comes. Clusters, components and quantisation are then chosen for the smallest file.
-    coarseness : float
+    relative_step : float
         Quantisation step of the field over the root mean square residual of the fit. At a
         half, quantisation adds some percent to the error; see `Quantisation`.
     """
@@ -88,7 +88,7 @@ class CompressionOptions:
     samples: SampleFitOptions = field(default_factory=SampleFitOptions)
     size: int = 0
     psnr: float = 0.0
-    coarseness: float = 0.5
+    relative_step: float = 0.5
 
     def __post_init__(self) -> None:
         if self.model not in ("auto", CLUSTERED, HALF_VECTOR):
@@ -119,7 +119,7 @@ class CompressionOptions:
                 f"size, psnr: expected one of them, received {self.size} bytes and "
                 f"{self.psnr} dB"
             )
-        check_ranges(self, {"coarseness": (1e-3, 1e3)})
+        check_ranges(self, {"relative_step": (1e-3, 1e3)})
 
     def fits_samples(self, n_samples: float) -> bool:
         """Whether to fit to the samples, of which a texel has `n_samples` on average.

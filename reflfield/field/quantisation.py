@@ -270,7 +270,7 @@ def smallest_codes(array: NDArray[Any]) -> NDArray[Any]:
         raise InputError(
             f"quantisation: expected steps whose codes fit 32 bits, received some of "
             f"{largest}; "
-            "make them coarser (compression.coarseness)"
+            "make them coarser (compression.relative_step)"
         )
     return np.ascontiguousarray(array, dtype=kinds[0])
 

@@ -32,7 +32,7 @@ from reflfield.util.validation import check_ranges
 Reader = Callable[[NDArray[np.intp]], TransformedSamples]
 
 # Largest values of options; beyond them a run takes days, or no machine holds the tables.
-MOST = {"rounds": 1000, "iterations": 10_000, "max_bytes": 1 << 40, "fineness": 16}
+MOST = {"rounds": 1000, "iterations": 10_000, "max_bytes": 1 << 40, "grid_refinement": 16}
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class SampleFitOptions:
         Standard deviation about each axis that the aligned frames are taken to have: half
         way through the rounds they are improved against the model, held by that much.
         0 keeps them.
-    fineness : float
+    grid_refinement : float
         Intervals between nodes in the second half of the rounds over those of the grid of the
         resampling (`field.clustered_model`). 1 keeps that grid.
     max_bytes : int
@@ -64,7 +64,7 @@ class SampleFitOptions:
     iterations: int = 12
     smoothness: float = 0.05
     frame_spread_deg: float = 1.0
-    fineness: float = 4 / 3
+    grid_refinement: float = 4 / 3
     max_bytes: int = 192 << 20
 
     def __post_init__(self) -> None:

@@ -70,7 +70,7 @@ PIXEL_ROWS = TABLE_ROWS // 2
 SAMPLES_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 4
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
-# Quantisation step of cube roots of samples over that of white, at a coarseness of a half.
+# Quantisation step of cube roots of samples over that of white, at a relative step of a half.
 STEP = 1 / 64
 
 
@@ -220,9 +220,9 @@ class HalfVectorFit:
         )
 
     def made(self, model: HalfVectorModel) -> HalfVectorField:
-        """Field of the size, the quality or the coarseness that was asked for."""
+        """Field of the size, the quality or the relative step that was asked for."""
         options = self.context.options.compression
-        step = self.step(options.coarseness)
+        step = self.step(options.relative_step)
 
         def build(at: float) -> HalfVectorField:
             return self.build(model, at)
@@ -233,9 +233,9 @@ class HalfVectorFit:
             return field_of_quality(build, self.quality, step, options.psnr)
         return build(step)
 
-    def step(self, coarseness: float) -> float:
+    def step(self, relative_step: float) -> float:
         """Quantisation step of cube roots of samples."""
-        return float(2 * coarseness * STEP * np.cbrt(self.white))
+        return float(2 * relative_step * STEP * np.cbrt(self.white))
 
     def quality(self, field: HalfVectorField) -> float:
         """LDR PSNR on the samples, dB."""

@@ -154,7 +154,7 @@ def _fitted_to_samples(
         frames[aligned] = refined.joined("frames")
         reader = reader.rotated(frames)
     n_functions = len(model.table) * (model.coefficients.shape[1] + 1)
-    sides = refined_sides(reader.sides, n_functions, options.fineness)
+    sides = refined_sides(reader.sides, n_functions, options.grid_refinement)
     model, reader = on_refined_grid(model, sides), replace(reader, sides=sides)
     return _fitted_once(context, model, reader, second, blocks, f"{name}, part 2"), reader
 

@@ -24,7 +24,7 @@ from reflfield.report.sections import RatePoint
 from reflfield.util.progress import track
 
 # Steps over the residual of the fit.
-COARSENESS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+RELATIVE_STEPS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 CURVES = {MAIN: "with alignment", "without_alignment": "without alignment"}
 HALF_VECTOR = "half vector"
 PAPER = "half floats, not factored"
@@ -42,20 +42,20 @@ def write_rate_distortion(context: Context, folder: Path) -> dict[str, Any]:
 def _half_vector_points(context: Context) -> list[RatePoint]:
     fit, model = HalfVectorFit(context.refined), stored_half_vector(context)
     sizes, points = PackedSizes(), []
-    for coarseness in track(COARSENESS, len(COARSENESS), "quality against size"):
-        field = fit.build(model, fit.step(coarseness))
+    for relative_step in track(RELATIVE_STEPS, len(RELATIVE_STEPS), "quality against size"):
+        field = fit.build(model, fit.step(relative_step))
         size = sizes.of(field)
         points.append(_point(context, fit.quality(field), field, HALF_VECTOR, size))
     return points
 
 
 def _clustered_points(context: Context) -> list[RatePoint]:
-    todo = [(v, stage, c) for v, stage in variants(context).items() for c in COARSENESS]
+    todo = [(v, stage, c) for v, stage in variants(context).items() for c in RELATIVE_STEPS]
     maker = FieldMaker(context, context.options.compression, {})
     sizes, points = PackedSizes(), []
-    for variant, stage, coarseness in track(todo, len(todo), "quality against size"):
+    for variant, stage, relative_step in track(todo, len(todo), "quality against size"):
         model, frames = stored_model(context, stage)
-        field = maker.build(model, frames, coarseness * model.residuals[-1])
+        field = maker.build(model, frames, relative_step * model.residuals[-1])
         quality = maker.quality(field)
         points.append(_point(context, quality, field, CURVES[variant], sizes.of(field)))
     model, frames = stored_model(context, "compression")

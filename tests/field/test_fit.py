@@ -491,10 +491,13 @@ class TestFit:
     [
         ({"rounds": 0}, "rounds: expected at least 1 and at most 1000, received 0"),
         ({"iterations": 0}, "iterations: expected at least 1"),
-        ({"fineness": 0.5}, "fineness: expected at least 1 and at most 16, received 0.5"),
         (
-            {"fineness": float("nan")},
-            "fineness: expected at least 1 and at most 16, received nan",
+            {"grid_refinement": 0.5},
+            "grid_refinement: expected at least 1 and at most 16, received 0.5",
+        ),
+        (
+            {"grid_refinement": float("nan")},
+            "grid_refinement: expected at least 1 and at most 16, received nan",
         ),
         ({"smoothness": -1.0}, "smoothness: expected 0 to"),
         ({"smoothness": float("nan")}, "smoothness: expected 0 to"),

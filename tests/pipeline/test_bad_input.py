@@ -247,7 +247,10 @@ class TestOptions:
             ("completion.method=magic", ("completion.method", "'map' or 'brand'", "'magic'")),
             ("completion.rank=1000000000", ("completion.rank", "at most 1024")),
             ("compression.rank=1000000000", ("compression.rank", "at most 1024")),
-            ("compression.samples.fineness=1e300", ("samples.fineness", "at most 16", "1e")),
+            (
+                "compression.samples.grid_refinement=1e300",
+                ("grid_refinement", "at most 16", "1e"),
+            ),
             ("compression.samples.rounds=0", ("compression.samples.rounds", "at least 1")),
             ("compression.training_texels=0", ("compression.training_texels", "at least 1")),
             ("texture.largest=0", ("texture.largest", "0")),

@@ -71,7 +71,7 @@ def rate_distortion_section(points: Sequence[RatePoint], note: str = "") -> Sect
     )
     return Section(
         "Quality against size",
-        "The field at several quantisation steps, of which compression.coarseness, "
+        "The field at several quantisation steps, of which compression.relative_step, "
         "compression.size or compression.psnr selects one.",
         (figure, _table(points), *((Note(note),) if note else ())),
     )
