@@ -11,28 +11,26 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
-from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.image_writing import write_png
-from reflfield.capture.lights import Light
-from reflfield.capture.readers import open_capture
-from reflfield.field.file import open_field
-from reflfield.options import read_toml, with_tables
-from reflfield.pipeline.pipeline_options import PipelineOptions
-from reflfield.pipeline.stages import run
-from reflfield.render.exposure import encoded_picture
-from reflfield.render.renderer import render
+import reflfield as rf
 
 
-def novel_camera(positions: np.ndarray, up: np.ndarray, size: int) -> Camera:
+def novel_camera(field: rf.Field, size: int) -> rf.Camera:
     """Look at the object from slightly above, from a side that no rig is likely to have."""
-    centre = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
-    radius = np.linalg.norm(positions - centre, axis=1).max()
-    aside = np.cross(up, [0.62, 0.31, 0.72])
-    position = centre + 6 * radius * (aside / np.linalg.norm(aside) + 0.3 * up)
-    pose = looking_at(position, centre, up)
-    focal, middle = 2.4 * size, 0.5 * size
-    return Camera("novel", "opencv", size, size, focal, focal, middle, middle, pose)
+    low, high = field.mesh.bounds
+    centre, radius = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low)
+    aside = np.cross(field.up, [0.62, 0.31, 0.72])
+    position = centre + 6 * radius * (aside / np.linalg.norm(aside) + 0.3 * field.up)
+    return rf.Camera.look_at(position, centre, field.up, width=size, height=size, fov_deg=23.5)
+
+
+def encoded(image: np.ndarray) -> Image.Image:
+    """Picture of an image with coverage: bright parts of the object are nearly white."""
+    radiance, coverage = image[..., :3], image[..., 3]
+    brightest = max(float(np.percentile(radiance[coverage > 0.5], 99.5)), 1e-9)
+    shown = np.clip(radiance / brightest, 0.0, 1.0) ** (1 / 2.2)
+    return Image.fromarray((255 * shown).round().astype(np.uint8))
 
 
 def main() -> None:
@@ -44,24 +42,16 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=400, help="side of the picture, pixels")
     arguments = parser.parse_args()
 
-    capture = open_capture(arguments.capture)
-    tables = read_toml(arguments.config) if arguments.config else {}
-    options = with_tables(PipelineOptions(), tables)
-    run(capture, arguments.out, options, last="compression")
-
-    field = open_field(arguments.out / "field.rfld")
-    camera = novel_camera(field.positions, capture.up, arguments.size)
-    towards_light = camera.centre + 0.5 * np.linalg.norm(camera.centre) * capture.up
-    light = Light(
-        "sun",
-        "directional",
-        direction=towards_light / np.linalg.norm(towards_light),
-        intensity=np.full(3, np.pi),
+    options = rf.read_options(arguments.config)
+    result = rf.reconstruct(
+        arguments.capture, arguments.out, options=options, until="compression"
     )
-    rendering = render(field, camera, light)
-    brightest = np.percentile(rendering.image[rendering.coverage > 0.5], 99.5)
+    field = result.field
+    camera = novel_camera(field, arguments.size)
+    above = camera.centre + 0.5 * np.linalg.norm(camera.centre) * field.up
+    image = field.render(camera, rf.DirectionalLight(above, np.pi), alpha=True)
     picture = arguments.out / "novel.png"
-    write_png(picture, encoded_picture(rendering.image, 1.0 / max(float(brightest), 1e-9)))
+    encoded(image).save(picture)
     print(picture)
 
 
