@@ -3,14 +3,16 @@
     python tests/benchmarks/bench_captures.py                        # all that are here
     python tests/benchmarks/bench_captures.py demo mitsuba_spot      # some
     python tests/benchmarks/bench_captures.py --without-alignment    # with the second field
+    python tests/benchmarks/bench_captures.py vase mitsuba_spot --model half_vector
 
 Every capture is processed by the command that a user would type, with its default options, in a
 process of its own. `demo` is ``reflfield demo``, simulation included; `vase` is its capture
 with default options; `tiny` is a capture for tests, run only by name. The others are test data:
 they are looked for in REFLFIELD_DATA, by default ../shared/data, and skipped where absent.
 
-Writes results/capture_NAME.json. CPU time is that of all threads and processes of the command.
-Peak memory is resident, of the command and its processes together. Run it on a quiet machine.
+Writes results/capture_NAME.json, with --model capture_NAME_MODEL.json. CPU time is that of all
+threads and processes of the command. Peak memory is resident, of the command and its processes
+together. Run it on a quiet machine.
 """
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ CAPTURES = {
         scene="demo_vase",
     ),
     "mitsuba_spot": Benchmark(
-        "32 x 32, rendered by Mitsuba 3",
+        "32 x 32, rendered",
         "2 views x 2 lights",
         ("--hold-out", "views=2,lights=2"),
         folder="mitsuba_spot",
@@ -117,16 +119,21 @@ def ran(module, words, log):
     return Spent(wall, usage.ru_utime + usage.ru_stime, 1024 * usage.ru_maxrss)
 
 
-def measure(name, folder, *, second_field, resources):
+def measure(name, folder, *, second_field=False, model=None, resources=()):
     """Process one capture in a folder, and write its results."""
     benchmark = CAPTURES[name]
     folder.mkdir(parents=True)
     out, log = folder / "out", folder / "log.txt"
-    results = Results(f"capture_{name}", f"Capture: {name}", MEASURED)
+    results = Results(
+        f"capture_{name}_{model}" if model else f"capture_{name}",
+        f"Capture: {name}, {model}" if model else f"Capture: {name}",
+        MEASURED,
+    )
     if benchmark.words:
         capture = capture_of(benchmark, folder, log)
-        second = SECOND_FIELD if second_field else ()
-        words = ("run", capture, "-o", out, *benchmark.words, *second, *resources)
+        more = (*(SECOND_FIELD if second_field else ()), *resources)
+        more += ("--set", f"compression.model={model}") if model else ()
+        words = ("run", capture, "-o", out, *benchmark.words, *more)
     else:
         capture, words = out / "capture", ("demo", "-o", out)
     spent = ran("reflfield", words, log)
@@ -227,12 +234,19 @@ def main():
         "--without-alignment", action="store_true",
         help="make a second field in the base frames, too; its time counts",
     )  # fmt: skip
+    parser.add_argument(
+        "--model", help="compression.model, instead of the default; not of demo"
+    )
     parser.add_argument("--out", type=Path, help="new folder in which the runs stay")
     parser.add_argument("--workers", type=int, help="threads of the run; one for each core")
     options = parser.parse_args()
     for name in options.names:
         if name not in CAPTURES:
             parser.error(f"NAME: expected {', '.join(CAPTURES)}, received {name}")
+    if options.model and "demo" in (options.names or every):
+        parser.error(
+            "--model: expected captures by name, without demo, whose options are fixed"
+        )
     resources = ("--workers", str(options.workers)) if options.workers else ()
     with ExitStack() as stack:
         root = options.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -242,7 +256,11 @@ def main():
                 print(f"{name}: skipped: {reason}", flush=True)
                 continue
             path = measure(
-                name, root / name, second_field=options.without_alignment, resources=resources
+                name,
+                root / name,
+                second_field=options.without_alignment,
+                model=options.model,
+                resources=resources,
             )
             print(f"{name}: {path}", flush=True)
 

@@ -28,10 +28,13 @@ HEAD = """# Results
 
 Written by `python tests/benchmarks/make_results.py` from `results/*.json`; do not edit. Each
 section names the command that measured it, the day, the commit (a + where the tree differed
-from it) and the machine.
+from it), the machine and its load, which is the number of cores that the command used where
+nothing else ran.
 """
 MARK = "> Older than the code: "
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
+# Load over cores above which wall times are not the command's own.
+MOST_LOAD = 2.0
 PACKAGES = ("python", "numpy", "scipy", "numba")
 
 
@@ -136,7 +139,8 @@ def section(result):
         f"## {result['title']}\n",
         f"`{result['command']}`\n",
         f"{result['date']}, commit {result['commit'] or 'unknown'}; {machine['processor']}, "
-        f"{machine['cores']} cores, {machine['memory_gb']} GB; {said}.\n",
+        f"{machine['cores']} cores, {machine['memory_gb']} GB, load "
+        f"{machine.get('load', 'unknown')}; {said}.\n",
         *(f"{line}\n" for line in mark(result)),
     ]
     for table in result["tables"]:
@@ -169,7 +173,7 @@ def readme_table(results):
     """The captures in short, one line for each set of images, and what is older."""
     rows = [row for result in results if is_capture(result) for row in short_rows(result)]
     captures = [result for result in results if is_capture(result)]
-    old = [result["name"].removeprefix("capture_") for result in captures if mark(result)]
+    old = [result["title"].removeprefix("Capture: ") for result in captures if mark(result)]
     marked = [f"{MARK}{', '.join(old)}.\n"] if old else []
     return "\n".join([markdown(rows), *marked]) if rows else "Nothing was measured yet.\n"
 
@@ -189,19 +193,27 @@ def short_rows(result):
         first = not rows
         rows.append(
             {
-                "capture": f"`{result['name'].removeprefix('capture_')}`" if first else "",
+                "capture": result["title"].removeprefix("Capture: ") if first else "",
                 "views x lights": run["photographs"] if first else "",
-                "images": row["images"],
+                "images": row["images"].partition(":")[0],
                 "PSNR, dB": f"{row['PSNR, dB']:.1f}",
                 "not aligned": "-" if base is None else f"{base:.1f}",
                 "SSIM": f"{row['SSIM']:.3f}",
                 "FLIP": f"{row['FLIP']:.3f}",
                 "field": f"{run['field, kB']:.0f} kB" if first else "",
-                "time": f"{run['wall time, s']:.0f} s" if first else "",
+                "time": wall_time(result, run) if first else "",
+                "CPU": f"{run['CPU time, s']:.0f} s" if first else "",
                 "memory": f"{run['peak memory, GB']:.1f} GB" if first else "",
             }
         )
     return rows
+
+
+def wall_time(result, run):
+    """Wall time of the run, or a dash where the machine had other work at the same time."""
+    machine = result["machine"]
+    busy = machine.get("load", float("inf")) > MOST_LOAD * machine["cores"]
+    return "-" if busy else f"{run['wall time, s']:.0f} s"
 
 
 def with_table(text, table):

@@ -149,7 +149,9 @@ class Results:
     """
 
     def __init__(self, name, title, modules):
-        self.name, self.title, self.modules = name, title, tuple(modules)
+        self.name, self.title = name, title
+        # Of now: the tree may change while a long benchmark runs.
+        self.commit, self.code = commit(), digests(modules)
         self.tables = []
 
     def table(self, title):
@@ -180,10 +182,10 @@ class Results:
             "title": self.title,
             "command": command(),
             "date": datetime.now(UTC).date().isoformat(),
-            "commit": commit(),
+            "commit": self.commit,
             "machine": machine(),
             "versions": versions(),
-            "code": digests(self.modules),
+            "code": self.code,
             "tables": self.tables,
         }
 
@@ -216,12 +218,13 @@ def commit():
 
 
 def machine():
-    """Processor, cores that this process may use, memory."""
+    """Processor, cores that this process may use, memory, and how busy all of it is."""
     names = re.findall(r"^model name\s*:\s*(.+)$", read_if_there("/proc/cpuinfo"), re.MULTILINE)
     return {
         "processor": names[0] if names else platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "memory_gb": round(psutil.virtual_memory().total / 2**30, 1),
+        "load": round(os.getloadavg()[1], 1),  # runnable processes, five minutes' mean
     }
 
 

@@ -15,7 +15,7 @@ from benchmarks import bench_captures, make_results, measuring
 def measured(finished):
     """Results of the tiny run, as if the benchmark had started it."""
     benchmark = bench_captures.CAPTURES["tiny"]
-    results = measuring.Results("capture_tiny", "Tiny", ["reflfield.cli"])
+    results = measuring.Results("capture_tiny", "Capture: tiny", ["reflfield.cli"])
     bench_captures.images_table(results, benchmark, finished.folder)
     spent = bench_captures.Spent(wall=9.0, cpu=12.0, peak_bytes=1 << 20)
     words = ("run", Path("somewhere/capture"), "-o", Path("somewhere/out"))
@@ -42,9 +42,18 @@ def test_images_size_time_and_memory_are_read(measured, finished):
 
 
 def test_rows_of_the_readme_follow(measured):
+    measured["machine"] |= {"cores": 2, "load": 2.5}
     first, second = make_results.short_rows(measured)
-    assert first["capture"] == "`tiny`"
+    assert first["capture"] == "tiny"
     assert first["time"] == "9 s"
     assert first["not aligned"] == "-"
     assert second["capture"] == ""
     assert second["images"] == "unseen views and lights"
+
+
+@pytest.mark.parametrize("load", [4.5, None])
+def test_wall_time_of_a_busy_machine_is_not_shown(measured, load):
+    measured["machine"] |= {"cores": 2, "load": load}
+    if load is None:
+        del measured["machine"]["load"]
+    assert make_results.short_rows(measured)[0]["time"] == "-"
