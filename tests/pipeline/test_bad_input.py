@@ -329,11 +329,11 @@ class TestRelightArguments:
             (("--orbit", "3", "--light", "up"), ("--light", "X,Y,Z", "'up'")),
             (("--orbit", "3", "--light", "0,0,0"), ("--light", "zero")),
             (("--orbit", "3", "--light", "nan,0,1"), ("--light", "finite")),
-            (("--orbit", "0", "--light", "1,0,1"), ("n_frames", "1 to 3600", "0")),
+            (("--orbit", "0", "--light", "1,0,1"), ("--orbit", "1 to 3600", "0")),
             (("--orbit", "3", "--light", "1,0,1", "--size", "0"), ("size", "1 to 16383", "0")),
             (
                 ("--orbit", "3", "--light", "1,0,1", "--rays-per-pixel", "3"),
-                ("samples", "square", "3"),
+                ("--rays-per-pixel", "square", "3"),
             ),
             (("--orbit", "3", "--environment", "no.exr"), ("no.exr",)),
             (("--capture", "nowhere"), ("nowhere", "does not exist")),
