@@ -154,7 +154,7 @@ def test_a_dark_held_out_frame_does_not_end_the_run(
     assert metrics["measured"]["silhouettes"] == {"photographs": 2}
     page = (out / "report" / "index.html").read_text()
     assert "2 made from all photographs of their cameras" in page
-    assert "25 pixels of the object are saturated in the photographs and left out" in page
+    assert "25 pixels of the object are saturated in the photographs and excluded" in page
     records = json.loads((out / "timings.json").read_text())["stages"]
     assert [r["counts"] for r in records if r["name"] == "held_out_silhouettes"] == [
         {"views": 1, "photographs": 1}
