@@ -30,6 +30,7 @@ from capture_sim.inputs import memory_limit
 from capture_sim.materials import material_presets
 from capture_sim.memory import parse_bytes
 from capture_sim.objects import object_presets
+from capture_sim.open3d_library import load_open3d
 from capture_sim.plan import plan as make_plan
 from capture_sim.record import table_lines
 from capture_sim.scene import Scene, load_scene, shipped_scenes
@@ -199,6 +200,7 @@ def _fail(message: str) -> NoReturn:
 @contextmanager
 def _interruptible(left: str) -> Iterator[None]:
     """End with status 130 and one line after Ctrl-C, once what was begun is in order."""
+    load_open3d()  # before: libraries that are being imported may turn what is raised into more
     before = signal.getsignal(signal.SIGINT)
     try:
         if before is not signal.SIG_IGN:
