@@ -93,8 +93,7 @@ class CompressionOptions:
     def __post_init__(self) -> None:
         if self.model not in ("auto", CLUSTERED, HALF_VECTOR):
             raise InputError(
-                "model: expected 'auto', 'clustered' or 'half_vector', received "
-                f"{self.model!r}"
+                f"model: expected 'auto', 'clustered' or 'half_vector', received {self.model!r}"
             )
         if self.fit not in ("auto", "samples", "grid"):
             raise InputError(

@@ -150,7 +150,7 @@ def half_angles() -> NDArray[np.float64]:
     Examples
     --------
     >>> np.degrees(half_angles()[16, 16:19]).round(2).tolist()
-    [0.0, 0.97, 2.0]
+    [0.0, 0.96, 1.98]
     """
     axis = np.linspace(-1.0, 1.0, HALF_SIDE)
     radius = np.hypot(axis[:, None], axis)

@@ -140,6 +140,7 @@ def depth_edges(scene: RayScene, camera: Camera, options: VisibilityOptions) -> 
 
     Examples
     --------
+    >>> from reflfield.geometry.mesh import Mesh
     >>> square = Mesh([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], [[0, 2, 1], [0, 3, 2]])
     >>> pose = np.eye(4)
     >>> pose[2, 3] = 1.0

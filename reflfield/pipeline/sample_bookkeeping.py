@@ -59,6 +59,8 @@ def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItem
     seen = observed.views.astype(np.float32) @ pairs
     shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
     unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
+    # As the completion counted them, where there is one.
+    handed_on = counts.get("completion", {}).get("samples observed", observed.count())
     used = counts["compression"]["samples fitted"]
     unmeasured = counts["compression"]["samples not measured"]
     shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
@@ -76,7 +78,7 @@ def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItem
             "in shadow: nothing made of them": int(shadowed) - shown - mixed,
             "not measured in any channel": unmeasured,
             "below the horizon of the texel's frame, or outside the light's cone": (
-                observed.count() - used - unmeasured
+                handed_on - used - unmeasured
             ),
         },
     )

@@ -15,7 +15,6 @@ from reflfield.geometry.uv_atlas import AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline import model_selection
-from reflfield.pipeline.context import Job
 from reflfield.pipeline.pipeline_options import ComparisonOptions, PipelineOptions
 from reflfield.pipeline.stages import run
 from reflfield.render.renderer import RenderOptions
@@ -90,14 +89,14 @@ def test_the_hull_stays_where_no_surface_is_asked_for(tiny_capture, tmp_path):
     ],
 )
 def test_auto_takes_the_model_that_the_samples_determine(
-    tiny_capture, tmp_path, monkeypatch, n_samples, compression, model
+    tiny_capture, tmp_path, context_of, monkeypatch, n_samples, compression, model
 ):
     options = replace(OPTIONS, compression=compression)
-    job = Job(open_capture(tiny_capture), tmp_path, options)
-    monkeypatch.setattr(model_selection, "samples_per_texel", lambda job: n_samples)
-    candidate = model_selection.candidates(job)[0]
+    context = context_of(open_capture(tiny_capture), tmp_path, options)
+    monkeypatch.setattr(model_selection, "samples_per_texel", lambda context: n_samples)
+    candidate = model_selection.candidates(context)[0]
     assert candidate.model == model
-    assert candidate.settled(options).aligns == (model == "clustered")
+    assert candidate.applied_to(options).aligns == (model == "clustered")
 
 
 def test_a_field_without_alignment_has_nothing_to_compare():

@@ -76,7 +76,7 @@ def test_frames_beyond_the_ceiling_are_refused(
     outcome = reflfield(command, ball_file, *words, "-o", tmp_path / "out", *limit)
     assert outcome.status == 2, outcome
     assert "--max-memory: expected at least" in outcome.err
-    assert f"pictures of {width**2} pixels, received 2.0 GB" in outcome.err
+    assert f"images of {width**2} pixels, received 2.0 GB" in outcome.err
 
 
 def test_what_would_suffice_does(ball):

@@ -14,7 +14,7 @@ from reflfield.util.blocks import BlockFiles
 KILLED_AT = """
 import os, signal, sys
 import reflfield.cli as cli
-from reflfield import terminal
+from reflfield.util import terminal
 
 last = int(sys.argv.pop(1))
 

@@ -32,7 +32,7 @@ def test_one_inverted_mask_is_named_everywhere(inverted, run_tiny, tmp_path, sai
     assert "it is inverted" in run.err
     page = (out / "report" / "index.html").read_text()
     assert said_of_inverted in page[: page.index("<section")]
-    assert "v004 (the hull is made without it)" in page
+    assert "v004 (excluded from the hull)" in page
     details = json.loads((out / "stages" / "hull" / "hull.json").read_text())
     assert details["left_out"] == ["v004"]
     assert details["contradictions"][0]["explanation"]["kind"] == "inverted"
