@@ -45,6 +45,8 @@ HUBER, ROUNDS = 0.1, 3
 ANCHOR_COSINE, ANCHOR_PIXELS, FARTHEST_PIXELS = 0.05, 0.5, 0.75
 # Share of the median information at which a normal counts by half.
 HALF_INFORMATION = 0.2
+# Edges count as at least this share of the mean length.
+SHORTEST_EDGE = 0.1
 # Texels that move a vertex.
 TEXELS_PER_VERTEX = 6
 
@@ -161,7 +163,9 @@ def _slopes(fitted: FittedNormals, graph: TexelGraph) -> tuple[csr_array, Array,
     normal = fitted.normals[i] + fitted.normals[j]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     step = fitted.positions[i] - fitted.positions[j]
-    length = np.maximum(np.linalg.norm(step, axis=1), 1e-300)
+    length = np.linalg.norm(step, axis=1)
+    # Texels of two charts may lie at one point: such an edge has no slope, and ties the two.
+    length = np.maximum(length, SHORTEST_EDGE * length.mean())
     rows = np.arange(len(i))
     entries = np.concatenate(
         [

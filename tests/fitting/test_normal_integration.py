@@ -74,6 +74,21 @@ def test_anchors_hold_the_surface_to_the_hull():
     assert np.abs(held).mean() < np.abs(free).mean()
 
 
+def test_texels_at_one_point_move_as_one():
+    """As those of two charts may: an edge without length divided by nothing before."""
+    positions, up, _ = plane()
+    height, normals = bumps(positions)
+    twice = np.concatenate([np.arange(SIDE**2), [100]])
+    positions, up, normals = positions[twice], up[twice], normals[twice]
+    i, j = texel_graph(positions, up).pairs.T
+    graph = TexelGraph(len(twice), np.stack([np.append(i, 100), np.append(j, SIDE**2)], axis=1))
+    fitted = FittedNormals(positions, up, normals, np.ones(len(up)))
+    found = integrated_displacements(fitted, graph, np.zeros(len(up)))
+    assert np.isfinite(found).all()
+    assert abs(found[-1] - found[100]) < 0.05 * np.abs(height).max()
+    assert np.abs(found[:-1] - height).max() < 0.25 * np.abs(height).max()
+
+
 def test_texels_without_neighbours_are_refused():
     fitted = FittedNormals(*(np.zeros((2, 3)) for _ in range(3)), np.ones(2))
     with pytest.raises(GeometryError, match="expected neighbouring texels"):

@@ -81,10 +81,10 @@ def test_the_hull_stays_where_no_surface_is_asked_for(tiny_capture, tmp_path):
 @pytest.mark.parametrize(
     ("n_samples", "compression", "model"),
     [
-        (5, CompressionOptions(), "clustered"),
-        (100, CompressionOptions(), "half_vector"),
-        (100, CompressionOptions(fit="grid"), "clustered"),
-        (10_000, CompressionOptions(), "clustered"),
+        (5, CompressionOptions(model="auto"), "clustered"),
+        (100, CompressionOptions(model="auto"), "half_vector"),
+        (100, CompressionOptions(model="auto", fit="grid"), "clustered"),
+        (10_000, CompressionOptions(model="auto"), "clustered"),
         (5, CompressionOptions(model="half_vector"), "half_vector"),
     ],
 )
