@@ -62,12 +62,14 @@ def test_its_field_shows_held_out_photographs(made):
     assert metrics["mean"]["psnr_ldr"] > LEAST_PSNR
 
 
+@pytest.mark.slow
 def test_it_is_the_same_bytes_for_any_number_of_workers(made, tiny_capture, tmp_path):
     half_vector_run(tiny_capture, tmp_path, workers=3)
     for name in ("field.rfld", "surface.ply"):
         assert (tmp_path / name).read_bytes() == (made / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_hull_stays_where_no_surface_is_asked_for(tiny_capture, tmp_path):
     compression = replace(
         OPTIONS.compression,
