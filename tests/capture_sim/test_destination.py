@@ -284,7 +284,7 @@ def test_ctrl_c_ends_with_status_130_and_one_line(tmp_path, capsys, monkeypatch)
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="libraries are seen in /proc")
-@pytest.mark.parametrize("seconds", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("seconds", [0.5, 1.5])
 def test_ctrl_c_in_the_first_seconds_is_one_line(tmp_path, seconds, started):
     """While libraries are imported, too: from the time when the first of them is there."""
     (tmp_path / "a.toml").write_text(SCENE.replace("n = 3", "n = 60"))
