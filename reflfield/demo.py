@@ -11,66 +11,23 @@ from pathlib import Path
 
 from reflfield.api.reconstruction import Result, reconstruct
 from reflfield.errors import ReflfieldError
-from reflfield.field.clustered_pca import CompressionOptions
-from reflfield.field.sample_fit import SampleFitOptions
+from reflfield.field.clustered_pca import HALF_VECTOR, CompressionOptions
+from reflfield.fitting.compilation import compile_kernels
 from reflfield.options import HoldOut, Resources
-from reflfield.pipeline.pipeline_options import (
-    AlignmentOptions,
-    ComparisonOptions,
-    CompletionOptions,
-    PipelineOptions,
-    TextureOptions,
-)
+from reflfield.pipeline.pipeline_options import PipelineOptions, TextureOptions
 from reflfield.util.child_processes import tied
 from reflfield.util.progress import report
 
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
 # The demo has to end within three minutes on two cores, compilation included: texels a little
-# coarser than usual, bases shaped by half as many, frames of the harmonic search, the fit
-# that trials would take with a third of its steps, and a second field for the comparison.
-TRAINING_TEXELS = 4096
+# coarser than usual.
 OPTIONS = PipelineOptions(
     texture=TextureOptions(texels_per_pixel=1.1),
-    completion=CompletionOptions(training_texels=TRAINING_TEXELS),
-    alignment=AlignmentOptions(refine=False),
-    compression=CompressionOptions(
-        fit="samples",
-        training_texels=TRAINING_TEXELS,
-        samples=SampleFitOptions(rounds=2, iterations=8, frame_spread_deg=0.0),
-    ),
-    comparison=ComparisonOptions(without_alignment=True),
+    compression=CompressionOptions(model=HALF_VECTOR),
 )
-
-
-# The smallest alignment and the smallest fit to samples that call all that the demo's do.
-COMPILE = """
-from concurrent.futures import ThreadPoolExecutor
-import numpy as np
-from reflfield.alignment import align
-from reflfield.field.clustered_model import ClusteredModel
-from reflfield.field.coefficients import solve_coefficients
-from reflfield.field.sample_fit import SampleFitOptions, fit_basis
-from reflfield.observations.texel_samples import TexelSamples, transformed_samples
-from reflfield.sphere.hemisphere import HemisphereGrid
-
-directions = HemisphereGrid(7).directions
-align(np.ones((2, 49, 49), np.float32), directions, directions, 4, refine=False)
-few = np.tile(directions[:5].astype(np.float32), (2, 1, 1))
-seen, pairs = np.ones((2, 5), bool), np.ones((5, 5), bool)
-texels = TexelSamples(np.ones((2, 5, 5, 3), np.float32), few, few, seen, seen, pairs)
-frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
-model = ClusteredModel(
-    np.zeros(2, np.int32),
-    np.zeros((2, 1), np.float32),
-    np.ones((1, 9, 9, 6), np.float32),
-    np.ones((1, 1, 1)),
-)
-samples = transformed_samples(texels, frames, (3, 3), "cube_root")
-fit_basis(lambda some: samples, model, np.arange(2), 1000, SampleFitOptions(rounds=1))
-with ThreadPoolExecutor(1) as pool:
-    solve_coefficients(samples, model.cluster, model, pool, bounded=True)
-"""
+# Run beside the first stages.
+COMPILE = f"from {compile_kernels.__module__} import compile_kernels; compile_kernels()"
 
 
 def run_demo(out: Path, workers: int) -> Result:
@@ -106,7 +63,7 @@ def run_demo(out: Path, workers: int) -> Result:
 
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
-    """Compile what alignment and fit need in a process of its own, beside the first stages.
+    """Compile what the fit needs in a process of its own, beside the first stages.
 
     Numba keeps it on disk, where the run finds it: a third of the compilation on a fresh
     machine. Compiled before, it takes two seconds; if it fails, the run compiles for itself.

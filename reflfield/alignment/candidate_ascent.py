@@ -18,6 +18,7 @@ from reflfield.alignment.newton_ascent import AscentLimits, ascend
 from reflfield.alignment.rotation_steps import (
     copy_matrix,
     copy_nearest,
+    copy_vector,
     cosine_between,
     half_turn_about_z,
 )
@@ -203,7 +204,7 @@ def _ascend_candidates(
             ascend(mine[c], series, limits, at)
             values[c] = at[0]
             if at[0] > least:
-                maximum[:] = at
+                copy_vector(at, maximum)
                 copy_matrix(mine[c], best)
         done[c] = True
 
@@ -227,7 +228,7 @@ def _try_half_turn(
         if cosine_between(mine[c], begun, False) > np.cos(0.5 * PEAK_DISTANCE):
             values[c] = at[0]
     if at[0] > maximum[0]:
-        maximum[:] = at
+        copy_vector(at, maximum)
         copy_matrix(other, best)
 
 

@@ -25,6 +25,7 @@ from reflfield.alignment.spline_targets import (
     place,
     value_at,
 )
+from reflfield.util.cholesky import cholesky_factor
 
 LONGEST_STEP = np.deg2rad(4.0)
 SHORT_STEP = np.deg2rad(0.01)
@@ -117,22 +118,6 @@ def hold(
 
 
 @numba.njit(cache=True, nogil=True)
-def _factor(normal: NDArray[np.float64]) -> bool:
-    """Cholesky factor of rows 0 .. 3 in place; row 4, the right side, is carried along."""
-    for n in range(4):
-        for k in range(n):
-            normal[n, n] -= normal[n, k] * normal[n, k]
-        if not normal[n, n] > 0.0:
-            return False
-        normal[n, n] = np.sqrt(normal[n, n])
-        for m in range(n + 1, 5):
-            for k in range(n):
-                normal[m, n] -= normal[m, k] * normal[n, k]
-            normal[m, n] /= normal[n, n]
-    return True
-
-
-@numba.njit(cache=True, nogil=True)
 def solve_step(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
     """Damped solution of the 4x4 normal equations, limited in length; False if singular."""
     largest = max(normal[0, 0], normal[1, 1], normal[2, 2])
@@ -141,7 +126,8 @@ def solve_step(normal: NDArray[np.float64], step: NDArray[np.float64]) -> bool:
     for n in range(3):
         normal[n, n] += DAMPING * largest
     normal[3, 3] *= 1.0 + DAMPING
-    if not _factor(normal):
+    # Row 4, the right side, is carried along.
+    if not cholesky_factor(normal, 4):
         return False
     for n in range(3, -1, -1):
         step[n] = normal[4, n]

@@ -17,7 +17,12 @@ from reflfield.alignment.correlation import (
     derivatives,
     empty_series,
 )
-from reflfield.alignment.rotation_steps import copy_matrix, rotate_right, scale_vector
+from reflfield.alignment.rotation_steps import (
+    copy_matrix,
+    copy_vector,
+    rotate_right,
+    scale_vector,
+)
 
 SHORTEST_STEP = 1e-4
 FIRST_TRUST_RADIUS = 0.25
@@ -138,7 +143,7 @@ def ascend(
                 radius = min(2.0 * radius, 0.5)
             copy_matrix(trial, rotation)
             value = f[0]
-            maximum[:10] = f
+            copy_vector(f, maximum)
         else:
             radius = 0.25 * length
         length, rise = _newton_step(maximum, radius, step)

@@ -19,6 +19,13 @@ def copy_matrix(source: NDArray[np.float64], out: NDArray[np.float64]) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def copy_vector(source: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """Entries of a vector into another's first (a slice takes seconds to compile)."""
+    for k in range(len(source)):
+        out[k] = source[k]
+
+
+@numba.njit(cache=True, nogil=True)
 def half_turn_about_z(rotation: NDArray[np.float64]) -> None:
     """Rotate the target of a rotation by half a turn about z, in place."""
     for i in range(3):

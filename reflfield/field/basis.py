@@ -99,7 +99,8 @@ def _accumulate(
     for t in range(len(samples.values)):
         light_taps = (samples.light_nodes[t], samples.light_taps[t])
         touched = lit[: touched_nodes(light_taps[0], samples.light_weights[t], lit)]
-        factor[1:] = coefficients[t]
+        for k in range(coefficients.shape[1]):
+            factor[k + 1] = coefficients[t, k]
         for i in np.flatnonzero(samples.view_weights[t]):
             taps = (samples.view_nodes[t, i], samples.view_taps[t, i])
             clear(spread, touched)

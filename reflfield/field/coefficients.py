@@ -24,6 +24,7 @@ from reflfield.field.sample_sums import (
     touched_nodes,
 )
 from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, TransformedSamples
+from reflfield.util.cholesky import cholesky_factor, solve_columns, solve_vector
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -70,6 +71,14 @@ def _add_normal_equations(
 
 
 @numba.njit(cache=True, nogil=True)
+def _trace(matrix: NDArray[np.float64]) -> float:
+    total = 0.0
+    for k in range(len(matrix)):
+        total += matrix[k, k]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
 def _solve_texel(
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
@@ -78,17 +87,32 @@ def _solve_texel(
     coefficients: Floats,
     squares: NDArray[np.float64],
 ) -> None:
-    """Coefficients of one texel; its squared residual falls by what they explain."""
-    full = np.tril(normal) + np.tril(normal, -1).T
-    mean = np.linalg.solve(full + precision, right)
-    coefficients[:] = mean
-    explained = 2 * np.dot(mean, right) - np.dot(mean, np.dot(full, mean))
+    """Coefficients of one texel; its squared residual falls by what they explain.
+
+    They stay as they are if they are not determined.
+    """
+    n = len(right)
+    full, factor, mean = np.zeros((n, n)), np.zeros((n, n)), right.copy()
+    for k in range(n):
+        for m in range(n):
+            full[k, m] = normal[max(k, m), min(k, m)]
+            factor[k, m] = full[k, m] + precision[k, m]
+    if not cholesky_factor(factor, n):
+        return
+    solve_vector(factor, mean)
+    explained = 0.0
+    for k in range(n):
+        coefficients[k] = mean[k]
+        image = 0.0
+        for m in range(n):
+            image += full[k, m] * mean[m]
+        explained += mean[k] * (2 * right[k] - image)
     squares[0] = max(squares[0] - explained, 0.0)
     # Each coefficient that the samples determine takes one of the values, of mean weight:
     # without this the noise is underestimated, the prior is too weak, and texels with few
     # samples overfit.
-    determined = np.trace(np.linalg.solve(full + precision, full))
-    squares[1] *= max(1.0 - determined / n_values, 0.0)
+    solve_columns(factor, full)
+    squares[1] *= max(1.0 - _trace(full) / n_values, 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -110,7 +134,7 @@ def _solve_bounded(
     """
     before = squares.copy()
     _solve_texel(normal, right, precision, n_values, coefficients, squares)
-    noise = max(squares[0] / max(squares[1], 1e-30), np.trace(precision) / len(right))
+    noise = max(squares[0] / max(squares[1], 1e-30), _trace(precision) / len(right))
     most = squares[0] + deviation**2 * len(right) * noise
     step = 0
     while step < STRENGTHENINGS and exceeds(at_probes, coefficients, top):
@@ -119,9 +143,10 @@ def _solve_bounded(
         weaker, rest = coefficients.copy(), before.copy()
         _solve_texel(normal, right, stronger, n_values, coefficients, rest)
         if rest[0] > most:
-            coefficients[:] = weaker
+            for k in range(len(weaker)):
+                coefficients[k] = weaker[k]
             return
-        squares[:] = rest
+        squares[0], squares[1] = rest[0], rest[1]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -134,11 +134,6 @@ class HalfVectorModel:
         return len(self.lobes)
 
     @property
-    def shared(self) -> tuple[Floats, Floats]:
-        """Tables of all texels, as kernels take them."""
-        return self.lobes, self.diffuse_table
-
-    @property
     def arrays(self) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """All arrays, as kernels take them."""
         return self.frames, self.diffuse, self.weights, self.lobes, self.diffuse_table
@@ -167,7 +162,7 @@ def _cell(position: Any, n_nodes: int) -> Any:
     return lower, min(max(position - np.float32(lower), _ZERO), _ONE)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def half_taps(frame: Any, view: Any, light: Any) -> Any:
     """Where a pair of directions stands in the tables.
 
@@ -226,7 +221,7 @@ def diffuse_tap(m: int, taps: Any) -> Any:
     return first + (m & 1) + ((m >> 1) & 1) * N_LIGHT + (m >> 2) * (N_LIGHT * N_VIEW), weight
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def diffuse_value(table: Any, taps: Any) -> Any:
     """Diffuse table, interpolated."""
     total = _ZERO
@@ -236,7 +231,7 @@ def diffuse_value(table: Any, taps: Any) -> Any:
     return total
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def lobe_values(lobes: Any, taps: Any, factor: Any, out: Any) -> None:
     """Lobes, interpolated and times a factor, into `out` (K, 3)."""
     out[:] = _ZERO
@@ -248,7 +243,7 @@ def lobe_values(lobes: Any, taps: Any, factor: Any, out: Any) -> None:
                 out[k, c] += weight * lobes[k, node, c]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def add_sample(
     frame: Any, view: Any, light: Any, diffuse: Any, weights: Any, tables: Any, out: Any
 ) -> None:
@@ -269,7 +264,7 @@ def add_sample(
                 out[c] += factor * lobes[k, node, c]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def rotated(frame: Any, axis: int, angle: Any, out: Any) -> None:
     """Frame rotated about one of its own axes, into `out`."""
     c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))

@@ -64,7 +64,9 @@ def _turn_by(q: NDArray[np.float64], vector: NDArray[np.float64]) -> None:
     q[1] = w * b + x * a + y * d - z * c
     q[2] = w * c - x * d + y * a + z * b
     q[3] = w * d + x * c - y * b + z * a
-    q /= np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    norm = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    for i in range(4):
+        q[i] /= norm
 
 
 @numba.njit(cache=True)
@@ -89,7 +91,8 @@ def _decode_turns(
         for i in range(3):
             vector[i] = codes[t, i] * step
         _turn_by(at, vector)
-        quaternions[t] = at
+        for i in range(4):
+            quaternions[t, i] = at[i]
 
 
 def codes_from_rotations(rotations: NDArray[np.floating], step: float) -> NDArray[np.int16]:
@@ -160,7 +163,8 @@ def rotations_from_codes(codes: NDArray[np.int16], step: float) -> NDArray[np.fl
     quaternions = np.zeros((len(codes), 4))
     if not len(codes):
         return np.zeros((0, 3, 3), np.float32)
-    _decode_turns(np.ascontiguousarray(codes, np.int16), float(np.float32(step)), quaternions)
+    # A copy: kernels are compiled again for arrays that cannot be written.
+    _decode_turns(codes.astype(np.int16, order="C"), float(np.float32(step)), quaternions)
     return matrix_from_quaternion(quaternions).astype(np.float32)
 
 

@@ -284,7 +284,7 @@ def _derivatives(texels: Any, views: Any, lights: Any, used: Any, model: Any, ou
                     by_rotations[row, j, r, c] = (ahead[c] - behind[c]) / (2 * HALF_ANGLE)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _pixel_value(pixel: Any, j: int, geometry: Any, x: Any, system: Any, out: Any) -> None:
     """A x at one pixel and light, into `out` (3,); x (m, 3 + K + 3)."""
     first, entry, share = geometry
@@ -302,7 +302,7 @@ def _pixel_value(pixel: Any, j: int, geometry: Any, x: Any, system: Any, out: An
             out[c] += share[e] * value
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _add_adjoint(pixel: Any, j: int, geometry: Any, residual: Any, system: Any, y: Any) -> None:
     """Add A^T of a residual (3,) at one pixel and light to y (m, 3 + K + 3)."""
     first, entry, share = geometry
@@ -333,7 +333,7 @@ def _apply(geometry: Any, values: Any, x: Any, system: Any, y: Any) -> None:
             _add_adjoint(pixel, j, geometry, shown, system, y)
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _add_diagonal(pixel: Any, j: int, geometry: Any, system: Any, diagonal: Any) -> None:
     """Add the squares of one pixel's derivatives, weighted, to the diagonal."""
     first, entry, share = geometry
@@ -350,7 +350,7 @@ def _add_diagonal(pixel: Any, j: int, geometry: Any, system: Any, diagonal: Any)
                 diagonal[row, 3 + n_lobes + r] += w * by_rotations[row, j, r, c] ** 2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _weigh(values: Any, shown: Any, weight: Any) -> Any:
     """Weights of one pixel's channels; `shown` becomes the weighted residual; its square."""
     error = 0.0

@@ -26,7 +26,7 @@ def display_weight(value: Any) -> Any:
     return weight
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def squared_weight(observed: Any, predicted: Any, huber: Any) -> Any:
     """Weight of the squared residual of an observed and a predicted value."""
     weight = display_weight(np.float32(0.5) * (observed + predicted))

@@ -12,13 +12,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.field.half_vector import (
     DIFFUSE_NODES,
-    FAST,
     HALF_SIDE,
     LOBE_NODES,
     N_DIFFERENCE,
@@ -26,13 +24,13 @@ from reflfield.field.half_vector import (
     N_PHASE,
     N_VIEW,
     HalfVectorModel,
-    diffuse_tap,
-    diffuse_value,
-    half_taps,
-    lobe_tap,
-    lobe_values,
 )
-from reflfield.fitting.robust_weights import TABLE_HUBER, squared_weight
+from reflfield.fitting.table_kernels import (
+    add_table_diagonal,
+    add_table_product,
+    add_table_right_side,
+    linearise_rows,
+)
 
 Floats = NDArray[np.float32]
 
@@ -96,166 +94,6 @@ class _Linearised:
     weight: Floats  # (n_rows, 3): of the squared residual
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _linearise(
-    first: Any,
-    texel: Any,
-    share: Any,
-    views: Any,
-    lights: Any,
-    values: Any,
-    model: Any,
-    taps: Any,
-    factor: Any,
-    weight: Any,
-) -> None:
-    """Taps and factors of entries; weights from the residuals of the model as it is."""
-    frames, diffuse, weights, lobes, table = model
-    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
-    part = np.zeros((lobes.shape[0], 3), np.float32)
-    shown = np.zeros(3, np.float32)
-    for row in range(len(values)):
-        shown[:] = np.float32(0.0)
-        for e in range(first[row], first[row + 1]):
-            t = texel[e]
-            at_lobe, at_diffuse, cosine, spread = half_taps(frames[t], views[e], lights[e])
-            lobe_node[e], fx, fy, fd = at_lobe
-            lobe_share[e, 0], lobe_share[e, 1], lobe_share[e, 2] = fx, fy, fd
-            diffuse_node[e], gl, gv, gp = at_diffuse
-            diffuse_share[e, 0], diffuse_share[e, 1], diffuse_share[e, 2] = gl, gv, gp
-            factor[e, 0] = share[e] * cosine
-            factor[e, 1] = share[e] * cosine * spread
-            base = factor[e, 0] * diffuse_value(table, at_diffuse)
-            lobe_values(lobes, at_lobe, factor[e, 1], part)
-            for c in range(3):
-                shown[c] += base * diffuse[t, c]
-                for k in range(lobes.shape[0]):
-                    shown[c] += weights[t, k] * part[k, c]
-        for c in range(3):
-            if np.isnan(values[row, c]):
-                continue
-            weight[row, c] = squared_weight(values[row, c], shown[c], TABLE_HUBER)
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _taps_of(e: int, node: Any, share: Any) -> Any:
-    return node[e], share[e, 0], share[e, 1], share[e, 2]
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _add_entry(
-    e: int, t: int, taps: Any, factor: Any, model: Any, tables: Any, out: Any
-) -> None:
-    """Add what an entry shows of tables to `out` (3,)."""
-    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
-    diffuse, weights = model
-    lobes, table = tables
-    base = factor[e, 0] * diffuse_value(table, _taps_of(e, diffuse_node, diffuse_share))
-    for c in range(3):
-        out[c] += base * diffuse[t, c]
-    at = _taps_of(e, lobe_node, lobe_share)
-    for m in range(8):
-        node, tap = lobe_tap(m, at)
-        for k in range(lobes.shape[0]):
-            scale = tap * factor[e, 1] * weights[t, k]
-            for c in range(3):
-                out[c] += scale * lobes[k, node, c]
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _spread_entry(
-    e: int, t: int, taps: Any, factor: Any, model: Any, residual: Any, out: Any
-) -> None:
-    """Adjoint of `_add_entry`: add a residual (3,) to tables."""
-    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
-    diffuse, weights = model
-    lobes_out, table_out = out
-    base = np.float32(0.0)
-    for c in range(3):
-        base += diffuse[t, c] * residual[c]
-    base *= factor[e, 0]
-    at = _taps_of(e, diffuse_node, diffuse_share)
-    for m in range(8):
-        node, tap = diffuse_tap(m, at)
-        table_out[node] += tap * base
-    at = _taps_of(e, lobe_node, lobe_share)
-    for m in range(8):
-        node, tap = lobe_tap(m, at)
-        for k in range(lobes_out.shape[0]):
-            scale = tap * factor[e, 1] * weights[t, k]
-            for c in range(3):
-                lobes_out[k, node, c] += scale * residual[c]
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _normal_product(
-    first: Any,
-    texel: Any,
-    taps: Any,
-    factor: Any,
-    weight: Any,
-    model: Any,
-    tables: Any,
-    out: Any,
-) -> None:
-    """Add A^T W A x to `out`; x and `out` are tables."""
-    shown = np.zeros(3, np.float32)
-    for row in range(len(weight)):
-        shown[:] = np.float32(0.0)
-        for e in range(first[row], first[row + 1]):
-            _add_entry(e, texel[e], taps, factor, model, tables, shown)
-        for c in range(3):
-            shown[c] *= weight[row, c]
-        for e in range(first[row], first[row + 1]):
-            _spread_entry(e, texel[e], taps, factor, model, shown, out)
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _right_side(
-    first: Any,
-    texel: Any,
-    taps: Any,
-    factor: Any,
-    weight: Any,
-    model: Any,
-    values: Any,
-    out: Any,
-) -> None:
-    """Add A^T W y to `out`."""
-    shown = np.zeros(3, np.float32)
-    for row in range(len(weight)):
-        for c in range(3):
-            shown[c] = np.float32(0.0)
-            if weight[row, c] > 0:
-                shown[c] = weight[row, c] * values[row, c]
-        for e in range(first[row], first[row + 1]):
-            _spread_entry(e, texel[e], taps, factor, model, shown, out)
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _diagonal(
-    first: Any, texel: Any, taps: Any, factor: Any, weight: Any, model: Any, out: Any
-) -> None:
-    """Add the diagonal of A^T W A to `out`, but for products of entries of one row."""
-    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
-    diffuse, weights = model
-    lobes_out, table_out = out
-    for row in range(len(weight)):
-        for e in range(first[row], first[row + 1]):
-            t = texel[e]
-            base = np.float32(0.0)
-            for c in range(3):
-                base += weight[row, c] * (factor[e, 0] * diffuse[t, c]) ** 2
-            for m in range(8):
-                node, tap = diffuse_tap(m, _taps_of(e, diffuse_node, diffuse_share))
-                table_out[node] += tap * tap * base
-                node, tap = lobe_tap(m, _taps_of(e, lobe_node, lobe_share))
-                for k in range(lobes_out.shape[0]):
-                    scale = (tap * factor[e, 1] * weights[t, k]) ** 2
-                    for c in range(3):
-                        lobes_out[k, node, c] += scale * weight[row, c]
-
-
 def _edges(shape: tuple[int, ...], strengths: tuple[float, ...]) -> tuple[Any, Any]:
     """Pairs (n, 2) of neighbouring nodes of a grid and the strength of their tie."""
     nodes = np.arange(np.prod(shape)).reshape(shape)
@@ -285,7 +123,10 @@ def _laplacian(edges: NDArray[Any], ties: NDArray[Any], x: NDArray[Any]) -> NDAr
 
 @dataclass(frozen=True, eq=False)
 class _TableSystem:
-    """Normal equations of the tables: rows by parts, smoothness and ridge."""
+    """Normal equations of the tables: rows by parts, smoothness and ridge.
+
+    Lobes are (LOBE_NODES, K, 3) here: what a row reads of a node lies together.
+    """
 
     linearised: _Linearised
     model: HalfVectorModel
@@ -298,7 +139,8 @@ class _TableSystem:
         """Sum of what is added by each part of the rows, in their order."""
 
         def one(part: slice) -> tuple[Floats, Floats]:
-            out = np.zeros_like(self.model.lobes), np.zeros_like(self.model.diffuse_table)
+            lobes = np.zeros((LOBE_NODES, self.model.n_lobes, 3), np.float32)
+            out = lobes, np.zeros_like(self.model.diffuse_table)
             add(part, out)
             return out
 
@@ -317,31 +159,31 @@ class _TableSystem:
         """A^T W y."""
         values = self.linearised.rows.values
         return self._over_rows(
-            lambda part, out: _right_side(*self._arguments(part), values[part], out)
+            lambda part, out: add_table_right_side(*self._arguments(part), values[part], out)
         )
 
     def product(self, lobes: NDArray[Any], table: NDArray[Any]) -> tuple[Any, Any]:
         """Normal matrix times tables."""
         single = (lobes.astype(np.float32), table.astype(np.float32))
         lobes_out, table_out = self._over_rows(
-            lambda part, out: _normal_product(*self._arguments(part), single, out)
+            lambda part, out: add_table_product(*self._arguments(part), single, out)
         )
-        columns = np.moveaxis(lobes, 0, 1).reshape(LOBE_NODES, -1)
-        smooth = _laplacian(LOBE_EDGES, self.lobe_ties, columns)
-        lobes_out += np.moveaxis(smooth.reshape(LOBE_NODES, -1, 3), 1, 0) + self.ridge * lobes
+        smooth = _laplacian(LOBE_EDGES, self.lobe_ties, lobes.reshape(LOBE_NODES, -1))
+        lobes_out += smooth.reshape(lobes.shape) + self.ridge * lobes
         ties = np.full((len(DIFFUSE_EDGES), 1), self.diffuse_tie)
         table_out += _laplacian(DIFFUSE_EDGES, ties, table[:, None])[:, 0]
         return lobes_out, table_out
 
     def diagonal(self) -> tuple[Any, Any]:
         """About the diagonal of the normal matrix, above zero."""
-        lobes, table = self._over_rows(lambda part, out: _diagonal(*self._arguments(part), out))
+        lobes, table = self._over_rows(
+            lambda part, out: add_table_diagonal(*self._arguments(part), out)
+        )
         ends = [
             np.bincount(LOBE_EDGES.ravel(), np.repeat(column, 2), LOBE_NODES)
             for column in self.lobe_ties.T
         ]
-        ties = np.stack(ends, axis=1).reshape(LOBE_NODES, -1, 3)
-        lobes += np.moveaxis(ties, 1, 0) + self.ridge
+        lobes += np.stack(ends, axis=1).reshape(lobes.shape) + self.ridge
         tiny = np.finfo(np.float32).tiny
         return lobes + tiny, table + 4 * self.diffuse_tie + tiny
 
@@ -383,11 +225,12 @@ def fit_tables(
         RIDGE * rows.n_rows / LOBE_NODES,
         pool,
     )
-    lobes, table = _conjugate_gradients(system, model.shared, iterations)
+    start = (np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1)), model.diffuse_table)
+    lobes, table = _conjugate_gradients(system, start, iterations)
     return normalised_tables(
         replace(
             model,
-            lobes=np.maximum(lobes, 0).astype(np.float32),
+            lobes=np.maximum(np.moveaxis(lobes, 1, 0), 0).astype(np.float32, order="C"),
             diffuse_table=np.maximum(table, LEAST_DIFFUSE).astype(np.float32),
         )
     )
@@ -438,7 +281,7 @@ def _linearised(
     taps = (found.lobe_node, found.lobe_share, found.diffuse_node, found.diffuse_share)
 
     def one(part: slice) -> None:
-        _linearise(
+        linearise_rows(
             rows.first[part.start : part.stop + 1],
             *(rows.texel, rows.share, rows.views, rows.lights, rows.values[part]),
             *(model.arrays, taps, found.factor, found.weight[part]),

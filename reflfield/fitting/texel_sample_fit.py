@@ -24,6 +24,7 @@ from reflfield.field.half_vector import (
 from reflfield.fitting.robust_weights import HUBER, squared_weight
 from reflfield.fitting.table_fit import TableRows, fit_tables
 from reflfield.observations.texel_samples import TexelSamples
+from reflfield.util.cholesky import cholesky_factor, solve_vector
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -133,7 +134,7 @@ class SampleBlocks:
         return list(pool.map(lambda n: function(self[n]), range(self.n_blocks)))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
 def _sums_of_texel(
     block: Any, row: int, texel: int, model: Any, normal: Any, right: Any, part: Any
 ) -> Any:
@@ -168,6 +169,15 @@ def _sums_of_texel(
 
 
 @numba.njit(cache=True, nogil=True)
+def _solve(system: Any, target: Any) -> Any:
+    """Solution of a positive system; both are kept."""
+    factor, solution = system.copy(), target.copy()
+    cholesky_factor(factor, len(factor))
+    solve_vector(factor, solution)
+    return solution
+
+
+@numba.njit(cache=True, nogil=True)
 def _solve_non_negative(normal: Any, right: Any) -> Any:
     """Minimum of a quadratic over non-negative numbers, by an active set that only grows."""
     n = len(right)
@@ -176,7 +186,7 @@ def _solve_non_negative(normal: Any, right: Any) -> Any:
             normal[x, y] = normal[y, x]
         normal[x, x] = normal[x, x] * 1.0001 + 1e-9
     system, target = normal.copy(), right.copy()
-    solution = np.linalg.solve(system, target)
+    solution = _solve(system, target)
     for _ in range(n):
         if solution.min() >= 0.0:
             break
@@ -186,7 +196,7 @@ def _solve_non_negative(normal: Any, right: Any) -> Any:
                 system[:, x] = 0.0
                 system[x, x] = 1.0
                 target[x] = 0.0
-        solution = np.linalg.solve(system, target)
+        solution = _solve(system, target)
     return np.maximum(solution, 0.0)
 
 
@@ -208,7 +218,9 @@ def _solve_texels(
         for x in range(len(right)):
             normal[x, x] += tie
             right[x] += tie * centre[x]
-        out[row] = _solve_non_negative(normal, right)
+        solution = _solve_non_negative(normal, right)
+        for x in range(len(right)):
+            out[row, x] = solution[x]
     return error, count
 
 
@@ -297,17 +309,28 @@ def _quantiles(block: Any, texels: Any, frames: Any, colors: Any) -> None:
     first, _, light, values, _, lights = block
     for row in range(len(texels)):
         normal = frames[texels[row], 2]
-        ratios = np.zeros((first[row + 1] - first[row], 3), np.float32)
+        ratios = np.zeros((3, first[row + 1] - first[row]), np.float32)
         n = 0
         for s in range(first[row], first[row + 1]):
             towards = lights[row, light[s]]
             cosine = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
-            if cosine >= LEAST_START_COSINE and not np.isnan(values[s]).any():
-                ratios[n] = values[s] / cosine
+            total = values[s, 0] + values[s, 1] + values[s, 2]
+            if cosine >= LEAST_START_COSINE and not np.isnan(total):
+                for c in range(3):
+                    ratios[c, n] = values[s, c] / cosine
                 n += 1
         if n > 2:
             for c in range(3):
-                colors[row, c] = max(np.quantile(ratios[:n, c], START_QUANTILE), 0.0)
+                colors[row, c] = max(_quantile(ratios[c, :n], START_QUANTILE), 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _quantile(values: Any, share: float) -> float:
+    """``numpy.quantile``, which takes long to compile."""
+    ordered = np.sort(values)
+    place = share * (len(ordered) - 1)
+    lower = min(int(place), len(ordered) - 2)
+    return float(ordered[lower] + (place - lower) * (ordered[lower + 1] - ordered[lower]))
 
 
 def sample_rows(blocks: SampleBlocks, most: int, seed: int) -> TableRows:

@@ -31,6 +31,7 @@ from reflfield.observations.texel_samples import (
     TransformedSamples,
     interpolation_matrices,
 )
+from reflfield.util.cholesky import cholesky_factor, solve_columns
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -267,10 +268,14 @@ def _operator(
     """
     half = np.sqrt(weights[counted].astype(np.float64))
     spread, system = _spread_over_nodes(nodes, taps, half, counted, prior, n_taps)
-    solved = np.linalg.solve(system, spread)
+    # Never singular: 1 was added to all eigenvalues.
+    cholesky_factor(system, len(system))
+    solve_columns(system, spread)
+    operator = np.zeros((len(prior), len(counted)), np.float32)
     for i in range(len(counted)):
-        solved[i] *= half[i]
-    return np.ascontiguousarray(solved.T).astype(np.float32)
+        for node in range(len(prior)):
+            operator[node, i] = half[i] * spread[i, node]
+    return operator
 
 
 @numba.njit(cache=True, nogil=True)
@@ -353,7 +358,7 @@ def _resample_texels(
                 continue
             one = np.zeros((out.shape[1], out.shape[2], 1), np.float32)
             _resample_channels(
-                values[t, :, :, c : c + 1],
+                _of_channel(values[t], c),
                 own_taps,
                 own_weights,
                 priors,
@@ -363,7 +368,18 @@ def _resample_texels(
                 n_sweeps,
                 one,
             )
-            out[t, :, :, c] = one[:, :, 0]
+            for node in np.ndindex(one.shape[:2]):
+                out[t, node[0], node[1], c] = one[node[0], node[1], 0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _of_channel(values: Floats, channel: int) -> Floats:
+    """Copy (a, b, 1) of one channel of (a, b, 3), in the layout that is compiled already."""
+    copy = np.zeros((values.shape[0], values.shape[1], 1), np.float32)
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            copy[i, j, 0] = values[i, j, channel]
+    return copy
 
 
 @numba.njit(cache=True, nogil=True)

@@ -44,7 +44,10 @@ def test_the_normal_matrix_is_symmetric_and_positive(small_rng):
     with ThreadPoolExecutor(2) as pool:
         system = system_of(model, rows, pool)
         a, b = (
-            (small_rng.normal(size=model.lobes.shape), small_rng.normal(size=DIFFUSE_NODES))
+            (
+                small_rng.normal(size=(LOBE_NODES, model.n_lobes, 3)),
+                small_rng.normal(size=DIFFUSE_NODES),
+            )
             for _ in range(2)
         )
         image_a, image_b = system.product(*a), system.product(*b)
@@ -59,7 +62,8 @@ def test_rows_that_the_model_explains_leave_no_gradient(small_rng):
     with ThreadPoolExecutor(1) as pool:
         system = replace(system_of(model, rows, pool), diffuse_tie=0.0, ridge=0.0)
         system = replace(system, lobe_ties=0 * system.lobe_ties)
-        right, image = system.right_side(), system.product(*model.shared)
+        lobes = np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1))
+        right, image = system.right_side(), system.product(lobes, model.diffuse_table)
     scale = np.abs(right[0]).max()
     np.testing.assert_allclose(image[0], right[0], atol=1e-4 * scale)
     np.testing.assert_allclose(image[1], right[1], atol=1e-4 * np.abs(right[1]).max())
@@ -120,3 +124,24 @@ def test_no_rows_leave_the_model_as_it_is(small_rng):
         rows.lights[:0], rows.values[:0],
     )  # fmt: skip
     assert fit_tables(none, model, ThreadPoolExecutor(1)) is model
+
+
+def test_entries_of_one_row_are_corners_of_their_own(small_rng):
+    """Rows of one entry reuse its corners for the adjoint, rows of several cannot."""
+    model = random_model(small_rng)
+    together = random_rows(small_rng, model, 50, per_row=1)
+    lobes = small_rng.normal(size=(LOBE_NODES, model.n_lobes, 3))
+    table = small_rng.normal(size=DIFFUSE_NODES)
+    n = len(together.texel)
+    twice = TableRows(
+        first=np.arange(0, 2 * n + 1, 2),
+        texel=np.repeat(together.texel, 2),
+        share=np.repeat(together.share, 2) / 2,
+        views=np.repeat(together.views, 2, axis=0),
+        lights=np.repeat(together.lights, 2, axis=0),
+        values=together.values,
+    )
+    with ThreadPoolExecutor(1) as pool:
+        one, two = (system_of(model, r, pool).product(lobes, table) for r in (together, twice))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(b, a, atol=1e-5 * np.abs(a).max())
