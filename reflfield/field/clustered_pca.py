@@ -78,7 +78,7 @@ class CompressionOptions:
         half, quantisation adds some percent to the error; see `Quantisation`.
     """
 
-    model: str = CLUSTERED
+    model: str = "auto"
     half_vector: HalfVectorOptions = field(default_factory=HalfVectorOptions)
     n_clusters: int = 8
     n_components: int = 6

@@ -25,6 +25,7 @@ used.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -65,7 +66,7 @@ LARGEST_SAMPLE = 1e33
 
 
 @dataclass(frozen=True, eq=False)
-class ReflectanceField:
+class ReflectanceField(ABC):
     """What fields of all models share. Made by `build.build_field` or `file.open_field`.
 
     Parameters
@@ -91,29 +92,34 @@ class ReflectanceField:
 
     model: ClassVar[str]
 
+    @abstractmethod
     def decode(self) -> None:
         """Decode what evaluation reads, before threads could each do it."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def light_nodes(self) -> int:
         """Numbers that a sum over lights keeps of each texel and channel."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def usual_root(self) -> float:
         """Root mean square of usual samples in the domain."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def counts(self) -> dict[str, int]:
         """Sizes of the model, by name."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def parts(self) -> dict[str, NDArray[np.floating]]:
         """Decoded parts of the model, by name."""
-        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def decoded_bytes(self) -> int:
+        """Memory of the decoded model, what is kept only while it is decoded included."""
 
     @cached_property
     def positions(self) -> NDArray[np.float64]:
@@ -269,6 +275,14 @@ class ClusteredField(ReflectanceField):
         """Decoded parts of the model, by name."""
         return {"coefficients": self.coefficients, "mean": self.mean, "basis": self.basis}
 
+    @property
+    def decoded_bytes(self) -> int:
+        """Memory of tables and coefficients, in singles."""
+        n_clusters, n_functions, _ = self.arrays["function_factor"].shape
+        nodes = len(self.arrays["view_factor"]) * len(self.arrays["light_factor"])
+        # The table once as it is decoded and once as it is kept.
+        return 2 * 12 * n_clusters * nodes * n_functions + 8 * n_functions * self.n_texels
+
     @cached_property
     def cluster(self) -> NDArray[np.int32]:
         """(n_texels,) int32 cluster of each texel."""
@@ -356,6 +370,12 @@ class HalfVectorField(ReflectanceField):
         """Decoded parts of the model, by name."""
         found = self.half_vector
         return {"diffuse": found.diffuse, "weights": found.weights, "lobes": found.lobes}
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Memory of lobes, weights and colours, in singles."""
+        sizes = (self.arrays[name].size for name in ("lobes", "lobe_weights", "diffuse"))
+        return 2 * 4 * sum(sizes)
 
     @cached_property
     def half_vector(self) -> HalfVectorModel:

@@ -164,12 +164,8 @@ RENDERED_TEXEL_BYTES = 160
 
 def field_bytes(field: ReflectanceField, n_directions: int) -> int:
     """Memory of a field, decoded for rendering, with its shadows under so many directions."""
-    shapes = {name: array.shape for name, array in field.arrays.items()}
-    n_clusters, n_functions, _ = shapes["function_factor"]
-    nodes = shapes["view_factor"][0] * shapes["light_factor"][0]
-    texel = RENDERED_TEXEL_BYTES + 8 * n_functions + n_directions // 8
-    # The table once as it is decoded and once as it is kept.
-    return 2 * 12 * n_clusters * nodes * n_functions + shapes["cluster"][0] * texel
+    texel = RENDERED_TEXEL_BYTES + n_directions // 8
+    return field.decoded_bytes + field.n_texels * texel
 
 
 def check_image_memory(

@@ -99,6 +99,7 @@ def test_a_material_whose_in_plane_angles_the_samples_tell_leaves_the_other_as_i
     assert errors.mean() < 1.05 * apart.mean()
 
 
+@pytest.mark.slow
 def test_few_texels_of_a_shiny_and_a_dull_material_are_told_apart(scene):
     # Of these, targets fitted to a third of the views took 64 % to the right material: with so
     # few texels, those views say nothing of the others.
@@ -108,6 +109,7 @@ def test_few_texels_of_a_shiny_and_a_dull_material_are_told_apart(scene):
     assert scene.frame_errors(found.local_from_base, frames)[0].mean() < 0.2
 
 
+@pytest.mark.slow
 def test_noise_of_two_per_cent_leaves_similar_materials_apart(scene, rng):
     _, d, samples, label = mixture(scene, rng, SIMILAR, 120)
     samples += 0.02 * samples.std() * rng.standard_normal(samples.shape, np.float32)
@@ -122,6 +124,7 @@ def test_history_never_falls_with_several_clusters(scene, rng):
     assert np.all(np.diff(found.history) >= -1e-6)  # float32 sums
 
 
+@pytest.mark.slow
 def test_scores_belong_to_the_cluster_that_texels_end_in(scene, rng, monkeypatch):
     _, d, samples, _ = mixture(scene, rng, FAR_APART[1:3], 80)
     options = RefinementOptions(side=9, rounds=1, last_steps=3)

@@ -47,6 +47,7 @@ def errors_less_common_rotation(found, truth):
     return np.rad2deg(normal), np.rad2deg(np.abs(turn))
 
 
+@pytest.mark.slow
 def test_angles_of_a_leaning_pile_are_found(scene, rng):
     d = scene.dome_directions()
     truth = frames_of_any_angle(rng, 100, 45.0)

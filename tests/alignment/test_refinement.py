@@ -43,6 +43,7 @@ def refined(data, frames):
     return state.targets, state.frames
 
 
+@pytest.mark.slow
 def test_directions_given_for_each_texel_give_the_same_as_common_ones(relief):
     data, start, _ = relief
     n = len(start)

@@ -68,7 +68,9 @@ def difference(one, other):
     return different + missing
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", ["paths", *(pytest.param(c, marks=pytest.mark.slow) for c in list(CASES)[1:])]
+)
 def test_no_byte_depends_on_the_blocks(case, tmp_path):
     whole = CASES[case]
     assert (lookup_nodes(measured(whole, RayTracer(whole.mesh))) is None) is (

@@ -13,6 +13,7 @@ from capture_sim.rays import RayTracer
 from capture_sim.scene import load_scene
 
 PRESETS = ("vase", "relief", "spot", "two_materials", "translucent", "bowl")
+TAKE_LONG = {"translucent", "bowl"}
 SIDE = 16  # pixels
 # Effects that have no picture of their own to compare.
 NO_PICTURE = {"dropped_photographs"}
@@ -35,7 +36,10 @@ def _coarse(camera):
     return {**camera, **scaled, "w": SIDE, "h": SIDE}
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(p, marks=pytest.mark.slow) if p in TAKE_LONG else p for p in PRESETS],
+)
 def test_the_plan_is_right(name):
     scene = small(name)
     tracer = RayTracer(scene.mesh, n_threads=2)

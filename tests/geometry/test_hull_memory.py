@@ -61,6 +61,7 @@ print(watch.peak_bytes - before, mesh.volume)
 """
 
 
+@pytest.mark.slow
 def test_many_large_silhouettes_take_the_memory_of_one(tmp_path):
     here = str(Path(__file__).parent)
     path = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))

@@ -51,6 +51,7 @@ def test_process_and_relight(tiny_capture, tiny_options, subprocess_run, tmp_pat
     assert not picture[:4, :4].any()
 
 
+@pytest.mark.slow
 def test_align_synthetic_btf(subprocess_run, tmp_path):
     done = subprocess_run(
         EXAMPLES / "align_synthetic_btf.py", "--size", 12, 9, "--noise", 0, "-o", tmp_path

@@ -3,8 +3,10 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from reflfield.capture.image_writing import write_exr
 from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
 from reflfield.field.clustered_pca import CompressionOptions
@@ -47,6 +49,16 @@ def made(tiny_capture, tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory):
+    """An environment map, dim but for a bright patch."""
+    path = tmp_path_factory.mktemp("sky") / "sky.exr"
+    pixels = np.full((8, 16, 3), 0.1, np.float32)
+    pixels[2, 4] = 20.0
+    write_exr(path, pixels)
+    return path
+
+
 def test_a_run_makes_field_surface_and_report(made):
     field = open_field(made / "field.rfld")
     assert field.model == "half_vector"
@@ -60,6 +72,28 @@ def test_a_run_makes_field_surface_and_report(made):
 def test_its_field_shows_held_out_photographs(made):
     metrics = json.loads((made / "metrics.json").read_text())
     assert metrics["mean"]["psnr_ldr"] > LEAST_PSNR
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("compare", "FIELD", "FRAMES", "--rays-per-pixel", "1"),
+        ("relight", "FIELD", "--capture", "FRAMES", "--rays-per-pixel", "1"),
+        ("relight", "FIELD", "--orbit", "1", "--size", "16", "--environment", "SKY"),
+        ("inspect", "FIELD"),
+    ],
+    ids=lambda words: words[0] + "-" * (len(words) > 2) + words[-2].strip("-"),
+)
+def test_commands_take_its_field(words, made, tiny_capture, sky, tmp_path, reflfield):
+    """Comparison and relighting once counted its memory as that of a clustered field."""
+    paths = {
+        "FIELD": made / "field.rfld",
+        "FRAMES": tiny_capture / "truth" / "heldout.json",
+        "SKY": sky,
+    }
+    out = () if words[0] == "inspect" else ("-o", tmp_path / "out")
+    outcome = reflfield(*(paths.get(word, word) for word in words), *out)
+    assert outcome.status == 0, outcome.err
 
 
 @pytest.mark.slow

@@ -104,7 +104,7 @@ def test_blocks_of_pixels_follow_ceiling_and_threads():
 
 
 class TestCeiling:
-    @pytest.mark.parametrize("ceiling", ["1GB", "8GB"])
+    @pytest.mark.parametrize("ceiling", ["1GB", pytest.param("8GB", marks=pytest.mark.slow)])
     def test_changes_no_byte_and_holds(self, finished, run_copy, run_tiny, ceiling):
         again = ("--from", "observations", "--until", "compression", "--max-memory", ceiling)
         assert run_tiny(run_copy, *again).status == 0

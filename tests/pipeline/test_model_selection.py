@@ -209,6 +209,7 @@ class TestSecondRun:
         page = (selected_copy / "report" / "index.html").read_text()
         assert "not accounted for." not in page
 
+    @pytest.mark.slow
     def test_from_model_selection_computes_the_candidates_again(self, selected_copy, run_auto):
         before = (selected_copy / "field.rfld").read_bytes()
         run_auto(selected_copy, *AUTO, first="model_selection", last="comparison")
@@ -229,6 +230,7 @@ class TestSecondRun:
         assert stamps(selected_copy / "candidates") == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs a system with SIGKILL")
 def test_killed_in_a_candidate_run_it_goes_on_there(
     selected_run, tiny_capture, tiny_options, subprocess_run, run_auto, tmp_path

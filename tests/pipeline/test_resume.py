@@ -89,6 +89,7 @@ def test_killed_at_random_moments_and_run_again(
     assert sum(map(len, left.values())) > 0
 
 
+@pytest.mark.slow
 def test_a_cluster_makes_the_same_bytes(finished, run_tiny, cluster, tmp_path):
     outcome = run_tiny(tmp_path / "run", "--until", "compression", "--scheduler", cluster)
     assert outcome.status == 0, outcome.err

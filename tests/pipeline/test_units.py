@@ -69,8 +69,8 @@ def usual(pictures):
     ("units", "tolerance"),
     [
         # Powers of two change no digit but in functions that are not exact to the last one.
-        ({"intensity": 2.0**-42}, 1e-3),
-        ({"length": 2.0**-21}, 1e-3),
+        pytest.param({"intensity": 2.0**-42}, 1e-3, marks=pytest.mark.slow),
+        pytest.param({"length": 2.0**-21}, 1e-3, marks=pytest.mark.slow),
         # Halves round samples otherwise, by 2^-11; two rounds on so coarse grids pass that on
         # to highlights, .03 when this was written.
         ({"intensity": 1e12, "length": 1e5}, 0.05),
