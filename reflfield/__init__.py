@@ -52,6 +52,7 @@ if _TYPE_CHECKING:
         ShapeError,
     )
     from reflfield.field.clustered_pca import CompressionOptions
+    from reflfield.field.half_vector import HalfVectorOptions
     from reflfield.field.sample_fit import SampleFitOptions
     from reflfield.geometry.occlusion import VisibilityOptions
     from reflfield.geometry.uv_atlas import AtlasOptions
@@ -86,6 +87,7 @@ __all__ = [
     "Field",
     "FieldFileError",
     "GeometryError",
+    "HalfVectorOptions",
     "HoldOut",
     "HullOptions",
     "IndirectOptions",
@@ -133,6 +135,7 @@ _MODULES = {
         *("CompressionOptions", "HullOptions", "IndirectOptions", "PipelineOptions"),
         *("ResamplingOptions", "TextureOptions", "VisibilityOptions"),
     ),
+    "reflfield.field.half_vector": ("HalfVectorOptions",),
     "reflfield.field.sample_fit": ("SampleFitOptions",),
     "reflfield.render.environment_map": ("EnvironmentMap",),
     "reflfield.render.renderer": ("RenderOptions",),

@@ -96,9 +96,9 @@ def simulate(capture: Path, workers: int) -> None:
 def simulator() -> str:
     """Path of the command ``capture-sim``, installed beside this one."""
     beside = Path(sys.executable).with_name("capture-sim")
-    found = str(beside) if beside.is_file() else shutil.which("capture-sim")
-    if found is None:
+    path = str(beside) if beside.is_file() else shutil.which("capture-sim")
+    if path is None:
         raise ReflfieldError(
             "capture-sim: expected beside reflfield, found none; install the distribution"
         )
-    return found
+    return path

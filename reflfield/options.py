@@ -270,10 +270,10 @@ def _is_number(value: Any) -> bool:
 
 def _converted_tuple(label: str, value: Any, expected: Any) -> tuple[Any, ...]:
     kinds = get_args(expected)
-    given = isinstance(value, (list, tuple))
-    if given and len(kinds) == 2 and kinds[1] is Ellipsis:
+    is_sequence = isinstance(value, (list, tuple))
+    if is_sequence and len(kinds) == 2 and kinds[1] is Ellipsis:
         kinds = kinds[:1] * len(value)
-    if not given or len(value) != len(kinds):
+    if not is_sequence or len(value) != len(kinds):
         raise _another_value(label, value, expected)
     return tuple(_converted(label, v, kind) for v, kind in zip(value, kinds, strict=True))
 

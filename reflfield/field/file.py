@@ -248,10 +248,10 @@ def packed_array(name: str, array: NDArray[Any]) -> PackedArray:
     filters = (KNOWN_FILTERS[name],) if name in KNOWN_FILTERS else TRIED_FILTERS
     if array.dtype.kind == "f" or array.shape[0] < 2:
         filters = ("none",)
-    found = [
+    packed_ways = [
         PackedArray(content, f, bits) for f in filters for content, bits in [pack(array, f)]
     ]
-    return min(found, key=lambda packed: len(packed.content))
+    return min(packed_ways, key=lambda packed: len(packed.content))
 
 
 def _header(reflectance_field: ReflectanceField, members: Mapping[str, PackedArray]) -> bytes:
@@ -342,10 +342,10 @@ def _members(
     """All members by name; exactly those of a field with these arrays, each once."""
     infos = archive.infolist()
     expected = sorted([HEADER, *map(member_name, arrays)])
-    found = sorted(info.filename for info in infos)
-    if found != expected:
-        missing = sorted(set(expected) - set(found))
-        surplus = sorted(set(found) - set(expected))
+    names = sorted(info.filename for info in infos)
+    if names != expected:
+        missing = sorted(set(expected) - set(names))
+        surplus = sorted(set(names) - set(expected))
         raise FieldFileError(
             f"{path}: expected the members of a reflectance field, missing: "
             f"{missing or 'none'}, not known: {surplus[:5] or 'none'}"

@@ -368,8 +368,8 @@ class HalfVectorField(ReflectanceField):
     @property
     def parts(self) -> dict[str, NDArray[np.floating]]:
         """Decoded parts of the model, by name."""
-        found = self.half_vector
-        return {"diffuse": found.diffuse, "weights": found.weights, "lobes": found.lobes}
+        model = self.half_vector
+        return {"diffuse": model.diffuse, "weights": model.weights, "lobes": model.lobes}
 
     @property
     def decoded_bytes(self) -> int:

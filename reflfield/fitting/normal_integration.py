@@ -20,7 +20,7 @@ SIGGRAPH 2005.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +88,7 @@ def confidence_of(information: Array) -> Array:
 
 def silhouette_anchors(
     cameras: Sequence[Camera],
-    distances: Sequence[SignedDistance | None],
+    distances: Iterable[SignedDistance | None],
     positions: Array,
     normals: Array,
 ) -> Array:
@@ -97,8 +97,8 @@ def silhouette_anchors(
     Parameters
     ----------
     cameras : sequence of Camera
-    distances : sequence of SignedDistance
-        To the outlines; None where a view shows none.
+    distances : iterable of SignedDistance
+        To the outlines, read once; None where a view shows none.
     positions, normals : (n, 3) float64
     """
     anchors = np.zeros(len(positions))

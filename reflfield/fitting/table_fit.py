@@ -144,9 +144,9 @@ class _TableSystem:
             add(part, out)
             return out
 
-        found = list(self.pool.map(one, self.linearised.rows.parts()))
-        lobes = np.sum([lobes for lobes, _ in found], axis=0, dtype=np.float64)
-        return lobes, np.sum([table for _, table in found], axis=0, dtype=np.float64)
+        sums = list(self.pool.map(one, self.linearised.rows.parts()))
+        lobes = np.sum([lobes for lobes, _ in sums], axis=0, dtype=np.float64)
+        return lobes, np.sum([table for _, table in sums], axis=0, dtype=np.float64)
 
     def _arguments(self, part: slice) -> tuple[Any, ...]:
         of, rows = self.linearised, self.linearised.rows
@@ -269,7 +269,7 @@ def _linearised(
     rows: TableRows, model: HalfVectorModel, pool: ThreadPoolExecutor
 ) -> _Linearised:
     n = len(rows.texel)
-    found = _Linearised(
+    linearised = _Linearised(
         rows,
         lobe_node=np.zeros(n, np.int32),
         lobe_share=np.zeros((n, 3), np.float32),
@@ -278,17 +278,20 @@ def _linearised(
         factor=np.zeros((n, 2), np.float32),
         weight=np.zeros((rows.n_rows, 3), np.float32),
     )
-    taps = (found.lobe_node, found.lobe_share, found.diffuse_node, found.diffuse_share)
+    taps = (
+        *(linearised.lobe_node, linearised.lobe_share),
+        *(linearised.diffuse_node, linearised.diffuse_share),
+    )
 
     def one(part: slice) -> None:
         linearise_rows(
             rows.first[part.start : part.stop + 1],
             *(rows.texel, rows.share, rows.views, rows.lights, rows.values[part]),
-            *(model.arrays, taps, found.factor, found.weight[part]),
+            *(model.arrays, taps, linearised.factor, linearised.weight[part]),
         )
 
     list(pool.map(one, rows.parts()))
-    return found
+    return linearised
 
 
 def _conjugate_gradients(

@@ -257,11 +257,11 @@ def solve_coefficients(
         )
         return block.texels, out, error, count
 
-    found = blocks.map(one, pool)
+    of_blocks = blocks.map(one, pool)
     diffuse, weights = model.diffuse.copy(), model.weights.copy()
-    for texels, coefficients, _, _ in found:
+    for texels, coefficients, _, _ in of_blocks:
         diffuse[texels], weights[texels] = coefficients[:, :3], coefficients[:, 3:]
-    error, count = (sum(part[i] for part in found) for i in (2, 3))
+    error, count = (sum(part[i] for part in of_blocks) for i in (2, 3))
     solved = replace(model, diffuse=diffuse, weights=weights)
     return solved, float(np.sqrt(error / max(count, 1)))
 
@@ -294,9 +294,9 @@ def with_start_colors(
         _quantiles(_kernel_block(block), block.texels, model.frames, colors)
         return block.texels, colors
 
-    found = blocks.map(one, pool)
+    colors_of_blocks = blocks.map(one, pool)
     diffuse = np.full_like(model.diffuse, np.nan)
-    for texels, colors in found:
+    for texels, colors in colors_of_blocks:
         diffuse[texels] = colors
     known = np.isfinite(diffuse)
     usual = float(np.median(diffuse[known])) if known.any() else 0.0

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryFile
+from threading import BoundedSemaphore
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,7 @@ from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import plain
 from reflfield.pipeline.context import Context
+from reflfield.pipeline.memory import writers_at_once
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.progress import report
@@ -66,8 +68,12 @@ TANGENT_ROUNDS = 2
 WHITE_TEXELS, WHITE_QUANTILE = 1024, 0.995
 # Rows of pixels that tables are fitted to; each has several texels.
 PIXEL_ROWS = TABLE_ROWS // 2
-# Share of the memory for samples kept, and for derivatives, which else go to files.
-SAMPLES_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 4
+# Share of the memory for samples kept, for pixels, and for derivatives; what is larger goes to
+# files, but for pixels, of which then only some are fitted to.
+SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 8, 1 / 4
+# Pixels under a light that are fitted to at most, a few for each unknown in what takes minutes,
+# and memory of one.
+MOST_PIXELS, PIXEL_BYTES = 32_000_000, 12
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
 # Quantisation step of cube roots of samples over that of white, at a relative step of a half.
@@ -116,12 +122,12 @@ class HalfVectorFit:
         ]
         luminance = np.concatenate(values) @ LUMINANCE if values else np.zeros(0, np.float32)
         luminance = luminance[np.isfinite(luminance)]
-        found = float(np.quantile(luminance, WHITE_QUANTILE)) if len(luminance) else 0.0
-        return found if found > 0 else 1.0
+        white = float(np.quantile(luminance, WHITE_QUANTILE)) if len(luminance) else 0.0
+        return white if white > 0 else 1.0
 
     def _block(self, texels: Indices, white: float) -> SampleBlock:
-        found = results.base_reader(self.context).measured(texels)
-        return sample_block(texels, found, self.reliable[texels], white)
+        samples = results.base_reader(self.context).measured(texels)
+        return sample_block(texels, samples, self.reliable[texels], white)
 
     def blocks(self, texels: Indices) -> SampleBlocks:
         """Samples of some texels in units of white."""
@@ -156,9 +162,9 @@ class HalfVectorFit:
     def to_photographs(self, model: HalfVectorModel, folder: Path) -> ImageFit:
         """Model in units of white, fitted to the photographs."""
         context = self.context
-        found = ImageFit(model, np.zeros(model.n_texels), 0.0)
+        fit = ImageFit(model, np.zeros(model.n_texels), 0.0)
         if not self.options.image_steps:
-            return found
+            return fit
         with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
             views = self.pixels(model, pool)
             rows = pixel_rows(views, PIXEL_ROWS, context.options.seed)
@@ -166,29 +172,43 @@ class HalfVectorFit:
             normals = results.texels(context).normal.astype(np.float64)
             for i in range(self.options.image_steps):
                 report("fit to the photographs", i, self.options.image_steps)
-                found = image_step(views, model, self.graph, normals, pool, allocate)
-                model = fit_tables(rows, found.model, pool, self.options.smoothness)
-                found = replace(found, model=model)
+                fit = image_step(views, model, self.graph, normals, pool, allocate)
+                model = fit_tables(rows, fit.model, pool, self.options.smoothness)
+                fit = replace(fit, model=model)
             report("fit to the photographs", self.options.image_steps, self.options.image_steps)
-        return found
+        return fit
 
     def pixels(self, model: HalfVectorModel, pool: ThreadPoolExecutor) -> list[ViewPixels]:
         """Pixels of all views with the texels under them, as the field will be rendered."""
-        context = self.context
+        context, texels = self.context, results.texels(self.context)
         surface = FieldSurface(self.build(model, 0.0))
+        share, seed = self.pixel_share, context.options.seed
+        # As many photographs at a time as the ceiling of memory allows.
+        readers = BoundedSemaphore(writers_at_once(context))
 
         def one(view: int) -> ViewPixels:
             camera = context.training.cameras[view]
-            usable = results.silhouettes(context)[view] >= LEAST_COVERAGE
-            if not context.is_plane:
-                usable &= ~depth_edges(surface.scene, camera, context.options.visibility)
-            texels = results.texels(context)
-            under = footprint_of(surface, camera, usable, texels.position, texels.normal)
-            return view_pixels(
-                context.training, view, under, texels.position, self.reliable, self.white
-            )
+            with readers:
+                usable = results.silhouettes(context)[view] >= LEAST_COVERAGE
+                if not context.is_plane:
+                    usable &= ~depth_edges(surface.scene, camera, context.options.visibility)
+                drawn = some_of(usable, share, np.random.default_rng([seed, view]))
+                under = footprint_of(surface, camera, drawn, texels.position, texels.normal)
+                return view_pixels(
+                    context.training, view, under, texels.position, self.reliable, self.white
+                )
 
         return list(pool.map(one, range(context.training.n_views)))
+
+    @property
+    def pixel_share(self) -> float:
+        """Share of the pixels that are fitted to."""
+        training, silhouettes = self.context.training, results.silhouettes(self.context)
+        covered = [np.count_nonzero(silhouette >= LEAST_COVERAGE) for silhouette in silhouettes]
+        n_photographs = (training.photograph_index >= 0).sum(axis=1)
+        total = int(np.dot(covered, n_photographs))
+        in_memory = self.context.resources.max_memory * PIXELS_SHARE / PIXEL_BYTES
+        return min(1.0, min(MOST_PIXELS, in_memory) / max(total, 1))
 
     def allocator(
         self, views: Sequence[ViewPixels], folder: Path
@@ -246,6 +266,18 @@ class HalfVectorFit:
             results.measured_texels(context),
             SAMPLES_MEASURED,
         ).psnr_ldr
+
+
+def some_of(
+    usable: NDArray[np.bool_], share: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """About a share of the pixels that are usable, drawn at random; all, if that is 1."""
+    if share >= 1.0:
+        return usable
+    at = np.flatnonzero(usable)
+    some = np.zeros(usable.shape, np.bool_)
+    some.ravel()[at[rng.random(len(at), np.float32) < share]] = True
+    return some
 
 
 def array_in_file(folder: Path, shape: tuple[int, ...]) -> Floats:
@@ -320,12 +352,12 @@ def fitted_on_surface(fit: HalfVectorFit, folder: Path) -> ImageFit:
 
 
 def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) -> ImageFit:
-    def found() -> dict[str, NDArray[Any]]:
+    def fitted() -> dict[str, NDArray[Any]]:
         image_fit = fit.to_photographs(model, folder)
         extra = {"information": image_fit.information, "residual": np.array(image_fit.residual)}
         return arrays_of(image_fit.model) | extra
 
-    stored: dict[str, Any] = fit.context.blocks(folder).once("fit to the photographs", found)
+    stored: dict[str, Any] = fit.context.blocks(folder).once("fit to the photographs", fitted)
     information, residual = stored.pop("information"), float(stored.pop("residual"))
     return ImageFit(HalfVectorModel(**stored), information, residual)
 
@@ -341,10 +373,10 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     """Fit a half-vector model, write its field, and measure it on the samples."""
     context = context.refined
     fit = HalfVectorFit(context)
-    found = (fitted_on_surface if context.on_surface else fitted_on_hull)(fit, folder)
-    made = fit.made(found.model)
+    model = (fitted_on_surface if context.on_surface else fitted_on_hull)(fit, folder).model
+    made = fit.made(model)
     write_field(folder / "field.rfld", made)
-    write_model(folder / MODEL, found.model, fit.white)
+    write_model(folder / MODEL, model, fit.white)
     size = (folder / "field.rfld").stat().st_size
     raw = int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 6
     error = sample_error(made, results.base_reader(context), results.measured_texels(context))
@@ -356,6 +388,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "texels that repeat another": made.n_texels - len(results.measured_texels(context)),
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
+        "share of the pixels fitted to": fit.pixel_share,
         **made.counts,
         "field bytes": size,
         "raw bytes": raw,

@@ -293,7 +293,7 @@ def _truth_sections(
 ) -> Iterator[Section]:
     if scores is not None:
         yield sections.truth_section(
-            hull=scores.hull,
+            surfaces=scores.surfaces,
             frames=scores.frames,
             base_frames=scores.base_frames,
             completion=scores.completion,

@@ -80,6 +80,12 @@ def hull_mesh(context: Context) -> Mesh:
     return read_ply(file(context, "hull", "hull.ply"))
 
 
+@cached("surface_mesh")
+def surface_mesh(context: Context) -> Mesh:
+    """Base surface moved to the fitted normals."""
+    return read_ply(file(context, "surface", "surface.ply"))
+
+
 @cached("atlas")
 def atlas(context: Context) -> Atlas:
     """Base surface with texture coordinates."""

@@ -32,16 +32,17 @@ from reflfield.pipeline.visibility import write_visibility
 def write_surface(context: Context, folder: Path) -> dict[str, Any]:
     """Fit on the hull, and move the hull so that it has the fitted normals."""
     fit = HalfVectorFit(context)
-    found = fitted_on_hull(fit, folder)
-    model, texels = found.model, results.texels(context)
+    fitted_to_images = fitted_on_hull(fit, folder)
+    model, texels = fitted_to_images.model, results.texels(context)
     normals = model.frames[:, 2].astype(np.float64)
     fitted = FittedNormals(
         positions=texels.position,
         base=texels.normal.astype(np.float64),
         normals=normals,
-        confidence=confidence_of(found.information),
+        confidence=confidence_of(fitted_to_images.information),
     )
-    distances = [_distance(silhouette) for silhouette in results.silhouettes(context)]
+    # One at a time: of large photographs all would not fit in memory.
+    distances = (_distance(silhouette) for silhouette in results.silhouettes(context))
     anchors = silhouette_anchors(context.training.cameras, distances, texels.position, normals)
     height = integrated_displacements(fitted, fit.graph, anchors)
     atlas = moved_atlas(results.atlas(context), texels.position, height[:, None] * fitted.base)

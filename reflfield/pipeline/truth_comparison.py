@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,14 +38,15 @@ class TruthScores:
 
     Parameters
     ----------
-    hull : HullDistance, optional
+    surfaces : mapping of str to HullDistance
+        Of the hull, and of the surface from normals where there is one.
     frames, base_frames : FrameErrors, optional
     completion : CompletionError, optional
     problems : tuple of str
         Files of the truth that could not be used, and why.
     """
 
-    hull: HullDistance | None = None
+    surfaces: Mapping[str, HullDistance] = field(default_factory=dict)
     frames: FrameErrors | None = None
     base_frames: FrameErrors | None = None
     completion: CompletionError | None = None
@@ -69,19 +70,24 @@ def truth_scores(context: Context, field: ReflectanceField) -> TruthScores | Non
             problems.append(f"truth: not compared: {error}")
             return None
 
-    hull = None if context.is_plane else score(lambda: hull_score(context, truth))
+    surfaces = {} if context.is_plane else score(lambda: surface_scores(context, truth))
     frames, base = score(lambda: frame_scores(context, truth, field)) or (None, None)
     completion = score(lambda: completion_score(context, truth))
-    return TruthScores(hull, frames, base, completion, tuple(problems))
+    return TruthScores(surfaces or {}, frames, base, completion, tuple(problems))
 
 
-def hull_score(context: Context, truth: Truth) -> HullDistance:
-    """Distance of the hull to the true surface, also in voxels of the hull's grid."""
+def surface_scores(context: Context, truth: Truth) -> dict[str, HullDistance]:
+    """Distances of hull and surface to the true one, also in voxels of the hull's grid."""
     details = json.loads((context.stages.root / "hull" / "hull.json").read_text())
-    mesh = results.hull_mesh(context)
-    return hull_distance(
-        (mesh.vertices, mesh.faces), truth.mesh(), voxel=details.get("spacing")
-    )
+    meshes = {"hull": results.hull_mesh(context)}
+    if context.refined.on_surface:
+        meshes["surface from normals"] = results.surface_mesh(context)
+    return {
+        name: hull_distance(
+            (mesh.vertices, mesh.faces), truth.mesh(), voxel=details.get("spacing")
+        )
+        for name, mesh in meshes.items()
+    }
 
 
 def frame_scores(

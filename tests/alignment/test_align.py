@@ -54,6 +54,7 @@ def test_refined_frames_share_no_rotation(relief, aligned):
     assert np.degrees(np.linalg.norm(common[:2, 2])) < 0.01
 
 
+@pytest.mark.slow
 def test_options_of_the_refinement_are_used_as_given(relief, scene):
     frames, directions, samples = relief
     one = RefinementOptions(rounds=1, last_steps=1)

@@ -63,7 +63,7 @@ SHINY_AND_DULL = (SIMILAR[0], {"nu": 20.0, "nv": 20.0, "diffuse": 0.4, "specular
     ids=["similar", "far apart"],
 )
 def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene, rng):
-    frames, d, samples, label = mixture(scene, rng, materials, 60 * len(materials))
+    frames, d, samples, label = mixture(scene, rng, materials, 40 * len(materials))
     found = align(samples, d, d, n_clusters=len(materials), refine=QUICK, n_threads=2)
     assert agreement(found.cluster, label) >= 0.99
     errors = scene.frame_errors(found.local_from_base, frames)[0]
@@ -217,6 +217,7 @@ def test_one_texel_and_none_observed_with_several_clusters(refine, scene, rng):
     assert np.array_equal(nothing.score, np.zeros(4))
 
 
+@pytest.mark.slow
 @pytest.mark.stability
 def test_a_cluster_of_one_texel_is_found_and_does_not_disturb(scene, rng):
     frames, d, samples, _ = mixture(scene, rng, FAR_APART[3:], 60)

@@ -35,7 +35,10 @@ def degrees(found, truth):
     return np.rad2deg(rotation_angle(np.swapaxes(truth, 1, 2) @ found))
 
 
-@pytest.mark.parametrize(("dtype", "largest"), [(np.float32, 1e-6), (np.float64, 1e-14)])
+@pytest.mark.parametrize(
+    ("dtype", "largest"),
+    [(np.float32, 1e-6), pytest.param(np.float64, 1e-14, marks=pytest.mark.slow)],
+)
 def test_correlation_error_grows_slowly_with_the_degree(dtype, largest, rng):
     limits, errors = np.array([2, 4, 8, 16]), []
     turns = Rotation.random(20, random_state=1).as_matrix()
@@ -170,6 +173,7 @@ def test_duplicates_get_one_answer_and_do_no_harm(scene):
     )
 
 
+@pytest.mark.slow
 def test_error_grows_in_proportion_to_noise_on_samples(scene, rng):
     d = scene.dome_directions()
     frames = scene.relief_frames(20, 12)[::4]

@@ -68,7 +68,7 @@ def scene(thing, material, **effects):
         ("sphere", "satin", SMALL),
         ("sphere", "satin", LARGE),
         pytest.param("relief", "greek_key", LARGE, marks=pytest.mark.slow),
-        ("vase", "gold", LARGE),
+        pytest.param("vase", "gold", LARGE, marks=pytest.mark.slow),
     ],
     ids=["small", "ball", "relief", "vase"],
 )

@@ -121,6 +121,7 @@ def test_sizes_that_are_none_are_refused(text):
         parse_bytes(text)
 
 
+@pytest.mark.slow
 @pytest.mark.stability
 @pytest.mark.skipif(not STATUS.exists(), reason="the peak is read from /proc")
 def test_the_ceiling_holds(tmp_path):

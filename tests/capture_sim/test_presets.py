@@ -13,7 +13,7 @@ from capture_sim.rays import RayTracer
 from capture_sim.scene import load_scene
 
 PRESETS = ("vase", "relief", "spot", "two_materials", "translucent", "bowl")
-TAKE_LONG = {"translucent", "bowl"}
+TAKE_LONG = {"translucent", "bowl", "spot", "vase"}
 SIDE = 16  # pixels
 # Effects that have no picture of their own to compare.
 NO_PICTURE = {"dropped_photographs"}

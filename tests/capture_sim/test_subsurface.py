@@ -59,6 +59,7 @@ def test_profile_integrates_to_the_albedo(albedo, refraction):
     assert (np.diff(dipole.profile(np.linspace(0.0, 0.05, 200))) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_evenly_lit_plate_is_lambertian_away_from_its_rim():
     scene = scene_of({"preset": "flat_sample", "size": [0.1, 0.1]}, 0.004, steps=4.0)
     image, lambert = photographs(scene), photographs(without(scene))

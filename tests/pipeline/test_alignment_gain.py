@@ -91,6 +91,7 @@ def test_held_out_error_is_lower_with_alignment_at_equal_size(capture, tmp_path)
     assert gain_db(capture, tmp_path) > 1.0
 
 
+@pytest.mark.slow
 def test_identity_frames_gain_nothing(capture, tmp_path, monkeypatch):
     """The test above fails where the frames are not those that alignment found."""
     write = alignment.np.savez

@@ -16,7 +16,8 @@ from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.uv_atlas import AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
 from reflfield.options import HoldOut, Resources
-from reflfield.pipeline import model_selection
+from reflfield.pipeline import half_vector_fit, model_selection
+from reflfield.pipeline.half_vector_fit import some_of
 from reflfield.pipeline.pipeline_options import ComparisonOptions, PipelineOptions
 from reflfield.pipeline.stages import run
 from reflfield.render.renderer import RenderOptions
@@ -138,3 +139,32 @@ def test_auto_takes_the_model_that_the_samples_determine(
 def test_a_field_without_alignment_has_nothing_to_compare():
     with pytest.raises(InputError, match=r"comparison\.without_alignment: expected"):
         replace(OPTIONS, comparison=ComparisonOptions(without_alignment=True))
+
+
+def test_pixels_are_drawn_evenly_and_all_where_all_fit(rng):
+    usable = np.zeros((60, 50), bool)
+    usable[10:50, 5:45] = True
+    assert some_of(usable, 1.0, rng) is usable
+    drawn = some_of(usable, 0.25, np.random.default_rng(3))
+    assert not (drawn & ~usable).any()
+    # Five standard deviations of a binomial count, of all and of a half.
+    for part in (slice(None), slice(0, 30)):
+        n = usable[part].sum()
+        assert abs(drawn[part].sum() - 0.25 * n) < 5 * np.sqrt(n * 0.25 * 0.75)
+
+
+@pytest.mark.slow
+def test_a_third_of_the_pixels_gives_nearly_the_same_field(
+    made, tiny_capture, tmp_path, monkeypatch
+):
+    record = json.loads((made / "stages" / "compression" / "stage.json").read_text())
+    assert record["counts"]["share of the pixels fitted to"] == 1.0
+    monkeypatch.setattr(half_vector_fit, "MOST_PIXELS", 3000)
+    half_vector_run(tiny_capture, tmp_path)
+    record = json.loads((tmp_path / "stages" / "compression" / "stage.json").read_text())
+    assert record["counts"]["share of the pixels fitted to"] < 0.4
+    psnr = [
+        json.loads((folder / "metrics.json").read_text())["mean"]["psnr_ldr"]
+        for folder in (made, tmp_path)
+    ]
+    assert psnr[1] > psnr[0] - 1.0

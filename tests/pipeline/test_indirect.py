@@ -71,7 +71,7 @@ def test_light_that_the_object_sends_to_itself_is_found(
                 "relighting.samples_per_pixel=4",
             ),
             *("--set", "comparison.without_alignment=false"),
-            *("--set", "comparison.rate_distortion=false"),
+            *("--set", "comparison.rate_distortion=false", "--until", "comparison"),
         )
         assert outcome.status == 0, outcome.err
         unseen = json.loads((out / "stages/comparison/field/truth.json").read_text())

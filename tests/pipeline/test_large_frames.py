@@ -52,14 +52,16 @@ def large_capture(tiny_capture, tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("model", ["clustered", "half_vector"])
 def test_large_frames_keep_below_the_ceiling_that_is_asked_for(
-    large_capture, tiny_options, subprocess_run, tmp_path
+    large_capture, tiny_options, subprocess_run, tmp_path, model
 ):
     def run(ceiling):
         return subprocess_run(
             *("-m", "reflfield.cli", "run", large_capture, "-o", tmp_path / "out"),
             *("--config", tiny_options, "--hold-out", "photographs=1"),
             *("--max-memory", ceiling, "--set", "comparison.without_alignment=false"),
+            *("--set", f"compression.model={model}"),
             *("--set", "comparison.rate_distortion=false"),
         )
 

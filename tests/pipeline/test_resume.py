@@ -55,7 +55,7 @@ def records(out):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs a system with SIGKILL")
-@pytest.mark.parametrize("n_kills", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_kills", [1, pytest.param(5, marks=pytest.mark.slow)])
 def test_killed_at_random_moments_and_run_again(
     finished, tiny_capture, tiny_options, subprocess_run, run_tiny, tmp_path, rng, n_kills
 ):

@@ -91,6 +91,7 @@ def error_of(clipped, exposed, tiny_options, folder):
     return float(np.sqrt(np.mean(squares)))
 
 
+@pytest.mark.slow
 def test_field_of_clipped_photographs_is_nearer_to_those_that_are_not(
     clipped, exposed, tiny_options, tmp_path, monkeypatch
 ):

@@ -97,7 +97,10 @@ def full_content(rng, title="vase", prefix="heldout_"):
             ),
             sections.alignment_section([0.80, 0.91, 0.94, 0.945], rng.exponential(0.1, n)),
             sections.truth_section(
-                hull=HullDistance(rng.normal(0.001, 0.001, 2000), voxel=0.002),
+                surfaces={
+                    "hull": HullDistance(rng.normal(0.001, 0.001, 2000), voxel=0.002),
+                    "surface from normals": HullDistance(rng.normal(0.0, 0.001, 2000)),
+                },
                 frames=errors[0],
                 base_frames=errors[1],
                 completion=CompletionError(0.08, 0.05, 0.06, 0.04, 40_000, 60_000),

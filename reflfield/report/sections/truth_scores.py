@@ -26,7 +26,7 @@ from reflfield.report.sections.held_out_images import comparisons_table
 
 def truth_section(
     *,
-    hull: HullDistance | None = None,
+    surfaces: Mapping[str, HullDistance] | None = None,
     frames: FrameErrors | None = None,
     base_frames: FrameErrors | None = None,
     completion: CompletionError | None = None,
@@ -36,7 +36,8 @@ def truth_section(
 
     Parameters
     ----------
-    hull : HullDistance, optional
+    surfaces : mapping of str to HullDistance, optional
+        By name, the hull first.
     frames, base_frames : FrameErrors, optional
         Of the recovered local frames, and of the hull's for comparison.
     completion : CompletionError, optional
@@ -48,8 +49,8 @@ def truth_section(
     Section
     """
     items: list[Item] = []
-    if hull is not None:
-        items += _hull_items(hull)
+    if surfaces:
+        items += _surface_items(surfaces)
     if frames is not None:
         items += _frame_items({"recovered": frames} | _optional("hull", base_frames))
     if completion is not None:
@@ -60,37 +61,44 @@ def truth_section(
     return Section("Against the truth", intro, tuple(items))
 
 
-def _hull_items(hull: HullDistance) -> list[Item]:
-    millimetres = 1e3 * hull.signed
-    limits = tuple(float(p) for p in np.percentile(millimetres, [0.5, 99.5]))
+def _surface_items(surfaces: Mapping[str, HullDistance]) -> list[Item]:
+    millimetres = {name: 1e3 * distance.signed for name, distance in surfaces.items()}
+    together = np.concatenate(list(millimetres.values()))
+    low, high = (float(p) for p in np.percentile(together, [0.5, 99.5]))
     plot = plots.histogram(
-        {"hull": millimetres},
+        millimetres,
         "signed distance from the true surface, mm",
-        "area of the hull, %",
-        limits=(limits[0], limits[1]) if limits[1] > limits[0] else None,
+        "area, %",
+        limits=(low, high) if high > low else None,
     )
     figure = Figure(
         (Panel(plot),),
         "A visual hull encloses the object, so most of its area should lie outside (right of "
         "0), far outside at concavities that no silhouette shows. Area left of 0 was carved "
-        "away wrongly or removed by smoothing.",
-        title="Hull against the true surface",
+        "away wrongly or removed by smoothing. A surface from normals has the shape of the "
+        "normals; where it lies, the hull decides.",
+        title="Surfaces against the true one",
         min_width=300,
     )
-    return [figure, _hull_table(hull.summary())]
+    return [figure, _distance_table({n: d.summary() for n, d in surfaces.items()})]
 
 
-def _hull_table(summary: Mapping[str, float]) -> Table:
+def _distance_table(summaries: Mapping[str, Mapping[str, float]]) -> Table:
     statistics = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "largest"}
+    rows = tuple(
+        (name, label, summary[f"{key}_mm"], summary.get(f"{key}_voxels"))
+        for name, summary in summaries.items()
+        for key, label in statistics.items()
+    )
+    shares = " ".join(
+        f"{summary['outside_share']:.1%} of the area of the {name} lies outside of the object, "
+        f"{summary['inside_share']:.1%} inside."
+        for name, summary in summaries.items()
+    )
     return Table(
-        ("distance", "mm", "voxels"),
-        tuple(
-            (label, summary[f"{key}_mm"], summary.get(f"{key}_voxels"))
-            for key, label in statistics.items()
-        ),
-        "Unsigned distance of the hull from the true surface. "
-        f"{summary['outside_share']:.1%} of the hull's area lies outside of the object, "
-        f"{summary['inside_share']:.1%} inside.",
+        ("surface", "distance", "mm", "voxels"),
+        rows,
+        f"Unsigned distance from the true surface. {shares}",
     )
 
 
