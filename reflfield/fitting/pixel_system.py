@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
+from reflfield.capture.lights import Light
 from reflfield.field.half_vector import (
     FAST,
     HalfVectorModel,
@@ -79,57 +80,54 @@ def footprint_of(
         Of the texels.
     """
     rows, columns = np.nonzero(usable)
+    on_surface = (surface, camera, positions, normals)
     parts = [
-        _footprint_part(surface, camera, rows[first:end], columns[first:end])
+        _footprint_part(*on_surface, rows[first:end], columns[first:end])
         for first in range(0, len(rows), PIXELS_AT_ONCE)
         for end in [first + PIXELS_AT_ONCE]
     ]
     if not parts:
-        nothing = np.zeros(0, np.int64)
-        return _without_grazing(camera, nothing, nothing, nothing, nothing, positions, normals)
-    starts = np.arange(0, len(rows), PIXELS_AT_ONCE)
-    pixel = np.concatenate([p[0] + s for p, s in zip(parts, starts, strict=True)])
-    texel, weight = (np.concatenate([p[i] for p in parts]) for i in (1, 2))
-    covered = np.bincount(pixel, weight, minlength=len(rows))
-    kept = covered[pixel] >= LEAST_COVERAGE * RAYS_PER_PIXEL
-    share = weight[kept] / covered[pixel[kept]]
-    at = np.stack([rows, columns], axis=1)
-    return _without_grazing(camera, at, pixel[kept], texel[kept], share, positions, normals)
+        return Footprint(
+            np.zeros((0, 2), np.int64),
+            np.zeros(1, np.int64),
+            np.zeros(0, np.int32),
+            np.zeros(0, np.float32),
+        )
+    pixels, counts, texel, share = (
+        np.concatenate(arrays) for arrays in zip(*parts, strict=True)
+    )
+    return Footprint(pixels, np.append(0, np.cumsum(counts)).astype(np.int64), texel, share)
 
 
 def _footprint_part(
-    surface: FieldSurface, camera: Camera, rows: Any, columns: Any
-) -> tuple[Any, Any, Any]:
-    """Pixel, texel and number of rays of the entries of some pixels."""
-    offsets = subpixel_offsets(RAYS_PER_PIXEL)
-    points = np.stack([columns, rows], axis=1)[:, None] + offsets
+    surface: FieldSurface,
+    camera: Camera,
+    positions: Array,
+    normals: Floats,
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32], Floats]:
+    """Pixels that may be used, number of their entries, and texel and share of each entry."""
+    at = np.stack([rows, columns], axis=1)
+    points = at[:, None, ::-1] + subpixel_offsets(RAYS_PER_PIXEL)
     hits = surface.first_hits(*surface.camera_rays(camera, points.reshape(-1, 2)))
     pixel = hits.ray // RAYS_PER_PIXEL
     entries = surface.footprints(hits, pixel, surface.transitions(camera, hits))
-    return entries.pixel, entries.texel, entries.summed(hits.front.astype(np.float32))
-
-
-def _without_grazing(
-    camera: Camera,
-    pixels: Any,
-    pixel: Any,
-    texel: Any,
-    share: Any,
-    positions: Array,
-    normals: Floats,
-) -> Footprint:
-    """Entries, by pixel, of those that are not seen at a grazing angle."""
+    pixel, texel = entries.pixel, entries.texel
+    weight = entries.summed(hits.front.astype(np.float32))
+    covered = np.bincount(pixel, weight, minlength=len(at))
+    share = weight / np.maximum(covered, 1e-9)[pixel]
     towards = camera.view_directions(positions[texel])
     cosine = np.einsum("nd,nd->n", towards, normals[texel])
-    grazing = np.bincount(pixel, share * (cosine < GRAZING_COSINE), minlength=len(pixels))
-    kept = (share > 0) & (grazing[pixel] < GRAZING_SHARE)
-    used, start = np.unique(pixel[kept], return_index=True)
-    n = int(np.count_nonzero(kept))
-    return Footprint(
-        pixels=pixels[used] if len(used) else np.zeros((0, 2), np.int64),
-        first=np.append(start, n).astype(np.int64),
-        texel=texel[kept].astype(np.int32),
-        share=share[kept].astype(np.float32),
+    grazing = np.bincount(pixel, share * (cosine < GRAZING_COSINE), minlength=len(at))
+    usable = (covered >= LEAST_COVERAGE * RAYS_PER_PIXEL) & (grazing < GRAZING_SHARE)
+    kept = (share > 0) & usable[pixel]
+    counts = np.bincount(pixel[kept], minlength=len(at))
+    return (
+        at[counts > 0],
+        counts[counts > 0],
+        texel[kept].astype(np.int32),
+        share[kept].astype(np.float32),
     )
 
 
@@ -190,17 +188,16 @@ def view_pixels(
     """
     photographs = capture.photograph_index[view]
     shown = np.flatnonzero(photographs >= 0)
-    texels, entry = np.unique(footprint.texel, return_inverse=True)
-    starts = footprint.first[:-1]
-    values = np.full((len(starts), len(shown), 3), np.nan, np.float32)
+    seen = np.zeros(len(positions), np.bool_)
+    seen[footprint.texel] = True
+    texels = np.flatnonzero(seen)
+    values = np.full((len(footprint.pixels), len(shown), 3), np.nan, np.float32)
     lights = tuple(capture.lights[i] for i in shown)
-    if len(starts):
-        weighted = positions[footprint.texel] * footprint.share[:, None]
-        irradiance = facing_irradiance(lights, np.add.reduceat(weighted, starts))
-        lit = np.logical_and.reduceat(reliable[footprint.texel][:, shown], starts)
+    if len(values):
+        irradiance, lit = _arriving(footprint, lights, positions, reliable[:, shown])
+        row, column = footprint.pixels.T
         for i, photograph in enumerate(photographs[shown]):
             image, measured = capture.read_measured(int(photograph))
-            row, column = footprint.pixels.T
             value = image[row, column] / (irradiance[:, i] * np.float32(white))
             good = measured[row, column] & lit[:, [i]] & (irradiance[:, i] > 0)
             values[:, i] = np.where(good, value, np.float32(np.nan))
@@ -209,12 +206,27 @@ def view_pixels(
     return ViewPixels(
         texels=texels.astype(np.int32),
         first=footprint.first,
-        entry=entry.ravel().astype(np.int32),
+        entry=(np.cumsum(seen, dtype=np.int32) - 1)[footprint.texel],
         share=footprint.share,
         values=values,
         views=capture.cameras[view].view_directions(points).astype(np.float32),
         lights=np.stack(directions, axis=1).astype(np.float32),
     )
+
+
+def _arriving(
+    footprint: Footprint, lights: tuple[Light, ...], positions: Array, reliable: Bools
+) -> tuple[Floats, Bools]:
+    """Irradiance (n_pixels, n_lights, 3) at each pixel's point, and which lights reach it."""
+    irradiance, lit = [], []
+    for first in range(0, len(footprint.pixels), PIXELS_AT_ONCE):
+        ends = footprint.first[first : first + PIXELS_AT_ONCE + 1]
+        texel = footprint.texel[ends[0] : ends[-1]]
+        share, starts = footprint.share[ends[0] : ends[-1]], ends[:-1] - ends[0]
+        points = np.add.reduceat(positions[texel] * share[:, None], starts)
+        irradiance.append(facing_irradiance(lights, points).astype(np.float32))
+        lit.append(np.logical_and.reduceat(reliable[texel], starts))
+    return np.concatenate(irradiance), np.concatenate(lit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,9 +71,10 @@ PIXEL_ROWS = TABLE_ROWS // 2
 # Share of the memory for samples kept, for pixels, and for derivatives; what is larger goes to
 # files, but for pixels, of which then only some are fitted to.
 SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 8, 1 / 4
-# Pixels under a light that are fitted to at most, a few for each unknown in what takes minutes,
-# and memory of one.
-MOST_PIXELS, PIXEL_BYTES = 32_000_000, 12
+# Pixels under a light that are fitted to at most: more would take hours.
+MOST_PIXELS = 32_000_000
+# Memory of a pixel under a light, and of a pixel with the texels under it.
+VALUE_BYTES, FOOTPRINT_BYTES = 12, 100
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
 # Quantisation step of cube roots of samples over that of white, at a relative step of a half.
@@ -206,9 +207,10 @@ class HalfVectorFit:
         training, silhouettes = self.context.training, results.silhouettes(self.context)
         covered = [np.count_nonzero(silhouette >= LEAST_COVERAGE) for silhouette in silhouettes]
         n_photographs = (training.photograph_index >= 0).sum(axis=1)
-        total = int(np.dot(covered, n_photographs))
-        in_memory = self.context.resources.max_memory * PIXELS_SHARE / PIXEL_BYTES
-        return min(1.0, min(MOST_PIXELS, in_memory) / max(total, 1))
+        n_values = int(np.dot(covered, n_photographs))
+        n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
+        in_memory = self.context.resources.max_memory * PIXELS_SHARE
+        return min(1.0, MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
 
     def allocator(
         self, views: Sequence[ViewPixels], folder: Path
