@@ -74,10 +74,12 @@ def usual(pictures):
         # Halves round samples otherwise, by 2^-11; two rounds on so coarse grids pass that on
         # to highlights, .03 when this was written.
         ({"intensity": 1e12, "length": 1e5}, 0.05),
+        # Whether angles about the normals were known once depended on such roundings.
+        ({"intensity": 1.3}, 0.05),
         # Vertices are rounded to a millionth of the ball's radius, and charts are made anew.
         ({"offset": SURVEY}, 0.05),
     ],
-    ids=["dim", "small", "bright-large", "survey"],
+    ids=["dim", "small", "bright-large", "other roundings", "survey"],
 )
 def test_pictures_do_not_depend_on_units(pictures, usual, units, tolerance):
     """Root mean square of the difference over that of the pictures."""
