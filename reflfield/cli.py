@@ -153,7 +153,8 @@ def run(
         str,
         typer.Option(
             metavar="views=K,lights=K",
-            help="Kept for comparison; or photographs=K, or test: the capture's test split.",
+            help="Kept for comparison; or views=K,light-cone=25deg, or photographs=K, or test: "
+            "the capture's test split.",
         ),
     ] = "",
     size: Annotated[

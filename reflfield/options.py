@@ -12,7 +12,7 @@ import types
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -393,6 +393,9 @@ def parse_bytes(text: str, name: str = "max_memory") -> int:
         ) from None
 
 
+HOLD_OUT_FORMS = "views=K,lights=K, or photographs=K, or test, or views=K,light-cone=DEGREESdeg"
+
+
 @dataclass(frozen=True)
 class HoldOut:
     """What a run keeps apart from the field's making, and compares the field with.
@@ -407,11 +410,16 @@ class HoldOut:
         `views` and `lights`.
     test : bool
         The photographs that the capture itself sets apart as its test split. Alone.
+    light_cone : float
+        All lights within this angle, degrees, of the middle one of the list, as seen from the
+        object: how well the field extrapolates, which single lights do not show. Instead of
+        `lights`.
 
     Raises
     ------
     InputError
-        If a count is negative or no whole number, or two ways to choose are mixed.
+        If a count is negative or no whole number, the angle is not 0 to 90, or two ways to
+        choose are mixed.
 
     Examples
     --------
@@ -427,6 +435,7 @@ class HoldOut:
     lights: int = 0
     photographs: int = 0
     test: bool = False
+    light_cone: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("views", "lights", "photographs"):
@@ -434,22 +443,27 @@ class HoldOut:
             whole = isinstance(count, Integral) and not isinstance(count, bool)
             if not whole or count < 0:
                 raise InputError(f"hold_out: {name}: expected a number >= 0, received {count}")
-        by_pairs = self.views > 0 or self.lights > 0
-        if by_pairs + (self.photographs > 0) + self.test > 1:
+        number = isinstance(self.light_cone, Real) and not isinstance(self.light_cone, bool)
+        if not number or not 0 <= self.light_cone <= 90:
             raise InputError(
-                "hold_out: expected views=K,lights=K, or photographs=K, or test, received "
-                f"{self}"
+                f"hold_out: light_cone: expected 0 to 90 degrees, received {self.light_cone}"
             )
+        by_pairs = self.views > 0 or self.lights > 0 or self.light_cone > 0
+        two_kinds_of_lights = self.lights > 0 and self.light_cone > 0
+        if by_pairs + (self.photographs > 0) + self.test > 1 or two_kinds_of_lights:
+            raise InputError(f"hold_out: expected {HOLD_OUT_FORMS}, received {self}")
 
     def __str__(self) -> str:
         """As `parse_hold_out` reads it."""
         counts = {name: getattr(self, name) for name in ("views", "lights", "photographs")}
         parts = [f"{name}={count}" for name, count in counts.items() if count]
+        if self.light_cone:
+            parts.append(f"light-cone={self.light_cone:g}deg")
         return ",".join(parts + ["test"] * self.test)
 
 
 def parse_hold_out(text: str) -> HoldOut:
-    """Counts of ``views=2,lights=3`` or ``photographs=4``, or ``test``.
+    """Parts of ``views=2,lights=3``, ``light-cone=25deg``, ``photographs=4`` or ``test``.
 
     Raises
     ------
@@ -458,22 +472,25 @@ def parse_hold_out(text: str) -> HoldOut:
 
     Examples
     --------
-    >>> parse_hold_out("lights=3")
-    HoldOut(views=0, lights=3, photographs=0, test=False)
+    >>> parse_hold_out("lights=3").lights, parse_hold_out("light-cone=25deg").light_cone
+    (3, 25.0)
     """
-    counts: dict[str, int] = {}
+    values: dict[str, Any] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
-        name, equals, number = part.partition("=")
-        count = int(number) if re.fullmatch("[0-9]{1,9}", number) else -1
-        if part == "test":
-            name, count = "test", 1
-        elif name not in ("views", "lights", "photographs") or not equals:
-            count = -1
-        if count < 0 or name in counts:
-            raise InputError(
-                "hold_out: expected views=K,lights=K, or photographs=K, or test, received "
-                f"{_shown(text)}"
-            )
-        counts[name] = count
-    test = counts.pop("test", 0) > 0
-    return HoldOut(test=test, **counts)
+        name, value = _hold_out_part(part)
+        if value is None or name in values:
+            raise InputError(f"hold_out: expected {HOLD_OUT_FORMS}, received {_shown(text)}")
+        values[name] = value
+    return HoldOut(**values)
+
+
+def _hold_out_part(part: str) -> tuple[str, Any]:
+    """Name of an argument of `HoldOut` and its value; None where the part has no such form."""
+    name, _, number = part.partition("=")
+    if part == "test":
+        return "test", True
+    if name == "light-cone" and re.fullmatch(r"[0-9]{1,3}(\.[0-9]{1,6})?(deg)?", number):
+        return "light_cone", float(number.removesuffix("deg"))
+    if name in ("views", "lights", "photographs") and re.fullmatch("[0-9]{1,9}", number):
+        return name, int(number)
+    return name, None

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.inspect import object_centre
+from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT
 from reflfield.errors import InputError
 from reflfield.options import HoldOut
 
@@ -94,6 +96,8 @@ def split_of(capture: Capture, hold_out: HoldOut) -> Split:
         raise InputError(f"{capture.name}: expected photographs, received none")
     views = _spread(hold_out.views, np.unique(view), "views")
     lights = _spread(hold_out.lights, np.unique(light), "lights")
+    if hold_out.light_cone:
+        lights = lights_in_cone(capture, np.unique(light), hold_out.light_cone)
     removed, compared, kind = _removed(capture, hold_out, (view, light), (views, lights))
     if removed.all():
         raise InputError(
@@ -114,6 +118,44 @@ def split_of(capture: Capture, hold_out: HoldOut) -> Split:
 
 def _spread(count: int, among: Indices, what: str) -> Indices:
     return among[evenly_spread(count, len(among), what)]
+
+
+def lights_in_cone(capture: Capture, among: Indices, degrees: float) -> Indices:
+    """Lights within an angle of the middle one, as seen from the object.
+
+    Parameters
+    ----------
+    capture : Capture
+    among : (n,) int
+        Lights that have photographs.
+    degrees : float
+
+    Returns
+    -------
+    (k,) int
+
+    Raises
+    ------
+    InputError
+        If a light has no known direction, or none would be left.
+    """
+    centre = object_centre(capture)[None]
+    unknown = [i for i in among if capture.lights[i].kind not in (POINT, SPOT, DIRECTIONAL)]
+    if unknown:
+        raise InputError(
+            "hold_out: light-cone: expected lights of known positions or directions, received "
+            f"{listed([light.id for light in capture.lights], unknown)} of another kind; take "
+            "lights=K"
+        )
+    towards = np.concatenate([capture.lights[i].directions(centre) for i in among])
+    middle = towards[len(among) // 2]
+    inside = towards @ middle >= np.cos(np.deg2rad(degrees)) - 1e-9
+    if inside.all():
+        raise InputError(
+            f"hold_out: expected a cone of lights that leaves some, {degrees:g} degrees hold "
+            f"{_all_of(len(among), 'lights')}; take a smaller angle"
+        )
+    return among[inside]
 
 
 def _removed(

@@ -209,7 +209,7 @@ def field_metadata(context: Context, made_with: dict[str, Any]) -> dict[str, Any
 
 def held_out(context: Context) -> dict[str, int]:
     """What of the capture did not make the field."""
-    held = {"views": context.hold_out.views, "lights": context.hold_out.lights}
+    held = {"views": len(context.split.views), "lights": len(context.split.lights)}
     chosen = context.hold_out.photographs > 0 or context.hold_out.test
     return held | ({"photographs": len(context.split.compared)} if chosen else {})
 

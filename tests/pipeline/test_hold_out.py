@@ -1,5 +1,6 @@
 """Which photographs are held out: of dense captures, and of one light for each photograph."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -185,7 +186,16 @@ class TestRefused:
             split_of(capture_of([], 2, 2), HoldOut())
 
     @pytest.mark.parametrize(
-        "values", [{"views": -1}, {"photographs": 1.5}, {"lights": True}, {"views": "2"}]
+        "values",
+        [
+            {"views": -1},
+            {"photographs": 1.5},
+            {"lights": True},
+            {"views": "2"},
+            {"light_cone": 91},
+            {"light_cone": float("nan")},
+            {"light_cone": "25"},
+        ],
     )
     def test_counts_that_are_none(self, values):
         with pytest.raises(InputError, match=f"hold_out: {next(iter(values))}"):
@@ -193,7 +203,17 @@ class TestRefused:
 
     @pytest.mark.parametrize(
         "text",
-        ["views=1,photographs=2", "test,views=1", "photographs=2,test", "tests", "test=1"],
+        [
+            "views=1,photographs=2",
+            "test,views=1",
+            "photographs=2,test",
+            "tests",
+            "test=1",
+            "lights=1,light-cone=20deg",
+            "test,light-cone=20deg",
+            "light-cone=wide",
+            "light-cone=-3",
+        ],
     )
     def test_ways_that_cannot_be_mixed(self, text):
         with pytest.raises(InputError, match="views=K,lights=K, or photographs=K, or test"):
@@ -201,7 +221,7 @@ class TestRefused:
 
 
 def test_the_text_says_what_it_was_read_from():
-    for text in ("views=2,lights=3", "photographs=4", "test", ""):
+    for text in ("views=2,lights=3", "photographs=4", "test", "views=1,light-cone=25deg", ""):
         assert str(parse_hold_out(text)) == text
 
 
@@ -211,3 +231,37 @@ def test_photographs_are_spread_whatever_order_they_come_in(rng):
     order = rng.permutation(30)
     again = order[spread_photographs(views[order], lights[order], 4)]
     assert sorted(again) == chosen.tolist()
+
+
+class TestLightCone:
+    """Eight directional lights around the zenith, 12 degrees apart on one great circle."""
+
+    @pytest.fixture
+    def fan(self):
+        capture = dense(3, 8)
+        angles = np.deg2rad(12.0 * np.arange(8) - 42.0)
+        lights = tuple(
+            Light(f"l{j}", "directional", direction=np.array([np.sin(a), 0.0, np.cos(a)]))
+            for j, a in enumerate(angles)
+        )
+        return replace(capture, lights=lights)
+
+    def test_lights_near_the_middle_one_are_held_out_together(self, fan):
+        split = split_of(fan, HoldOut(views=1, light_cone=25.0))
+        assert split.lights.tolist() == [2, 3, 4, 5, 6]
+        assert pairs_of(fan, split.compared) == [(1, j) for j in (2, 3, 4, 5, 6)]
+        assert {j for _, j in pairs_of(fan, split.trained)} == {0, 1, 7}
+
+    def test_without_views_all_are_compared(self, fan):
+        split = split_of(fan, HoldOut(light_cone=13.0))
+        assert split.lights.tolist() == [3, 4, 5]
+        assert len(split.compared) == 9
+
+    def test_a_cone_of_all_lights_is_refused(self, fan):
+        with pytest.raises(InputError, match="60 degrees hold the 8 lights"):
+            split_of(fan, HoldOut(light_cone=60.0))
+
+    def test_lights_of_unknown_direction_are_refused(self, fan):
+        lights = (*fan.lights[:7], Light("sky", "unknown"))
+        with pytest.raises(InputError, match=r"light-cone: .*'sky'"):
+            split_of(replace(fan, lights=lights), HoldOut(light_cone=25.0))
