@@ -443,8 +443,9 @@ class HoldOut:
             whole = isinstance(count, Integral) and not isinstance(count, bool)
             if not whole or count < 0:
                 raise InputError(f"hold_out: {name}: expected a number >= 0, received {count}")
-        number = isinstance(self.light_cone, Real) and not isinstance(self.light_cone, bool)
-        if not number or not 0 <= self.light_cone <= 90:
+        cone: Any = self.light_cone
+        number = isinstance(cone, Real) and not isinstance(cone, bool)
+        if not number or not 0 <= cone <= 90:
             raise InputError(
                 f"hold_out: light_cone: expected 0 to 90 degrees, received {self.light_cone}"
             )
