@@ -12,7 +12,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.alignment.frame_ambiguity import Symmetry, reduce_by_cluster
+from reflfield.alignment.frame_ambiguity import (
+    Symmetry,
+    reduce_by_cluster,
+    with_view_over_tangent,
+)
 from reflfield.alignment.horizon_imputation import Horizon, impute_and_ascend
 from reflfield.alignment.in_plane_rotation import angle_margin, improve_with_angles
 from reflfield.alignment.refinement import RefinementOptions, SharpAlignment
@@ -49,6 +53,12 @@ class Projection:
     projector: Projector
     prior: NDArray[np.float32]
     max_tilt: float | None
+
+    @property
+    def constant_view(self) -> NDArray[np.float64] | None:
+        """The view (3,) in the base frames, where it alone does not vary; else None."""
+        views, lights = self.projector.views, self.projector.lights
+        return views[0] if len(views) == 1 < len(lights) else None
 
     def options(self, n_threads: int) -> SearchOptions:
         """Options of all searches."""
@@ -215,6 +225,9 @@ class AlignmentModel:
         if self.sharp is not None:
             result = self._refined(self.sharp, result, coupled, raw, n_threads)
         rotations = reduce_by_cluster(result.rotations, result.cluster, self.symmetries)
+        view = self.projection.constant_view
+        if view is not None:
+            rotations = with_view_over_tangent(rotations, result.cluster, self.symmetries, view)
         rotations[result.score == 0.0] = np.eye(3)
         frames = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
         return BlockFrames(frames, result.cluster, result.score, result.margin)

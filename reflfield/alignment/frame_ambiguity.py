@@ -7,6 +7,10 @@ reflectances have, its axis is the normal: it is known far better than the mean 
 frames. What the reflectance itself leaves undetermined about the normal is reduced to the
 fundamental zone nearest to the base frame: the in-plane angle of an isotropic target, and the
 sign of the tangent of one that a half turn leaves unchanged.
+
+Where the view does not vary (RTI), samples are functions of the light alone, and those of an
+isotropic reflectance differ by the azimuth of the view in the local frame: the in-plane angle
+that the reflectance leaves free puts the view over the local x axis.
 """
 
 from __future__ import annotations
@@ -145,6 +149,45 @@ def reduce_by_cluster(
         mine = cluster == k
         reduced[mine] = reduce_to_fundamental_zone(rotations[mine], symmetry)
     return reduced
+
+
+def with_view_over_tangent(
+    rotations: NDArray[np.float64],
+    cluster: NDArray[np.int32],
+    symmetries: Sequence[Symmetry],
+    view: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Rotations whose free in-plane angle puts a constant view over the local x axis.
+
+    Parameters
+    ----------
+    rotations : (n, 3, 3) float64
+        `base_from_local`.
+    cluster : (n,) int32
+    symmetries : sequence of Symmetry
+        Of each cluster's target; only the angles of isotropic ones are free.
+    view : (3,) float64
+        Unit vector in the base frames.
+
+    Returns
+    -------
+    (n, 3, 3) float64
+
+    Examples
+    --------
+    A normal tilted by .4 about x, seen from the base normal:
+
+    >>> tilted = rotation_about(X_AXIS, 0.4)
+    >>> turned = with_view_over_tangent(
+    ...     tilted, np.zeros(1, np.int32), [Symmetry("all")], Z_AXIS[0]
+    ... )
+    >>> (turned[0].T @ Z_AXIS[0]).round(3) + 0.0
+    array([0.389, 0.   , 0.921])
+    """
+    free = np.array([symmetry.kind == "all" for symmetry in symmetries], bool)[cluster]
+    local = view @ rotations
+    azimuth = np.where(free, np.arctan2(local[:, 1], local[:, 0]), 0.0)
+    return rotations @ rotation_about(np.tile(Z_AXIS, (len(rotations), 1)), azimuth)
 
 
 def in_plane_undetermined(rotations: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
