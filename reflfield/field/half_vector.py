@@ -26,7 +26,7 @@ editing", SIGGRAPH 2006.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -63,8 +63,9 @@ class HalfVectorOptions:
 
     Parameters
     ----------
-    n_lobes : int
-        Functions of the half vector that all texels share, 1 to 4.
+    n_lobes : int or "auto"
+        Functions of the half vector that all texels share, 1 to 4; "auto": the fewest that
+        show samples of views left out as well as more would.
     image_steps : int
         Gauss-Newton steps on the photographs themselves, where a pixel is the weighted sum of
         the texels under it; 0 keeps the fit to the texels' samples.
@@ -75,15 +76,15 @@ class HalfVectorOptions:
         Of the lobes, relative to what the samples weigh.
     """
 
-    n_lobes: int = 3
+    n_lobes: int | Literal["auto"] = "auto"
     image_steps: int = 2
     surface_from_normals: bool = True
     smoothness: float = 3e-4
 
     def __post_init__(self) -> None:
-        check_ranges(
-            self, {"n_lobes": (1, 4), "image_steps": (0, 20), "smoothness": (1e-9, 1e3)}
-        )
+        check_ranges(self, {"image_steps": (0, 20), "smoothness": (1e-9, 1e3)})
+        if self.n_lobes != "auto":
+            check_ranges(self, {"n_lobes": (1, 4)})
 
     @property
     def moves_surface(self) -> bool:

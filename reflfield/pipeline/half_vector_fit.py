@@ -23,6 +23,12 @@ from reflfield.field.half_vector_build import build_half_vector_field
 from reflfield.field.reflectance_field import HalfVectorField
 from reflfield.field.step_search import field_of_quality, field_of_size
 from reflfield.fitting.image_fit import ImageFit, frames_with, image_step, pixel_rows
+from reflfield.fitting.lobe_count import (
+    fewest_lobes,
+    left_out_errors,
+    rounds_of,
+    views_left_out,
+)
 from reflfield.fitting.pixel_system import (
     LEAST_COVERAGE,
     ViewPixels,
@@ -60,8 +66,8 @@ Indices = NDArray[np.intp]
 
 # Texels that shape the tables before all get coefficients.
 TRAINING_TEXELS = 8192
-# Rounds of tables and coefficients of one lobe, and of several, which part slowly.
-ROUNDS, ROUNDS_OF_SEVERAL = 4, 8
+# Texels that the number of lobes is found on, and lobes where no view can be left out.
+LOBE_TEXELS, USUAL_LOBES = 1024, 3
 # Times that tangents are turned along the highlights.
 TANGENT_ROUNDS = 2
 # Texels and quantile of their samples' luminance that is taken for white.
@@ -77,6 +83,8 @@ MOST_PIXELS = 32_000_000
 VALUE_BYTES, FOOTPRINT_BYTES = 12, 100
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
+# In its record.
+LOBE_ERRORS = "weighted error of views left out, by the number of lobes"
 # Quantisation step of cube roots of samples over that of white, at a relative step of a half.
 STEP = 1 / 64
 
@@ -137,18 +145,46 @@ class HalfVectorFit:
         white = self.white
         return SampleBlocks(lambda n: self._block(parts[n], white), len(parts), budget)
 
-    def to_samples(self) -> HalfVectorModel:
+    def lobe_errors(self, folder: Path) -> NDArray[np.float64]:
+        """Errors on views left out with one lobe, two and so on; empty where not measured."""
+        context = self.context
+        left_out = views_left_out(context.training.n_views)
+        if self.options.n_lobes != "auto" or not left_out.any():
+            return np.zeros(0)
+
+        def measured() -> dict[str, NDArray[Any]]:
+            some = self.blocks(results.random_texels(context, LOBE_TEXELS))
+            frames = results.texels(context).local_from_world
+            with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
+                errors = left_out_errors(
+                    *(some, frames, left_out, pool, self.options.smoothness),
+                    context.options.seed,
+                )
+            return {"errors": errors}
+
+        stored = context.blocks(folder).once("lobes by views left out", measured)
+        return np.asarray(stored["errors"], np.float64)
+
+    def n_lobes(self, folder: Path) -> int:
+        """Lobes that were asked for, or that the views left out ask for."""
+        asked = self.options.n_lobes
+        if asked != "auto":
+            return asked
+        errors = self.lobe_errors(folder)
+        return fewest_lobes(errors) if len(errors) else USUAL_LOBES
+
+    def to_samples(self, n_lobes: int) -> HalfVectorModel:
         """Model in units of white, fitted to the samples of the texels."""
-        context, n_lobes = self.context, self.options.n_lobes
+        context = self.context
         with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
             blocks = self.blocks(results.measured_texels(context))
             model = start_model(results.texels(context).local_from_world, n_lobes)
             model = with_start_colors(blocks, model, pool)
-            rounds = ROUNDS if n_lobes == 1 else ROUNDS_OF_SEVERAL
             some = self.blocks(results.random_texels(context, TRAINING_TEXELS))
             report("functions of the half vector", 0, 2 + TANGENT_ROUNDS)
             model, _ = fit_to_samples(
-                some, model, pool, rounds, self.options.smoothness, context.options.seed
+                *(some, model, pool, rounds_of(n_lobes)),
+                *(self.options.smoothness, context.options.seed),
             )
             report("functions of the half vector", 1, 2 + TANGENT_ROUNDS)
             model, _ = solve_coefficients(blocks, model, pool)
@@ -169,7 +205,7 @@ class HalfVectorFit:
         with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
             views = self.pixels(model, pool)
             rows = pixel_rows(views, PIXEL_ROWS, context.options.seed)
-            allocate = self.allocator(views, folder)
+            allocate = self.allocator(views, model.n_lobes, folder)
             normals = results.texels(context).normal.astype(np.float64)
             for i in range(self.options.image_steps):
                 report("fit to the photographs", i, self.options.image_steps)
@@ -213,10 +249,10 @@ class HalfVectorFit:
         return min(1.0, MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
 
     def allocator(
-        self, views: Sequence[ViewPixels], folder: Path
+        self, views: Sequence[ViewPixels], n_lobes: int, folder: Path
     ) -> Callable[[tuple[int, ...]], Floats]:
         """Maker of arrays for derivatives: in memory, or in files where they are too many."""
-        shapes = [s for view in views for s in linearisation_shapes(view, self.options.n_lobes)]
+        shapes = [s for view in views for s in linearisation_shapes(view, n_lobes)]
         total = 4 * sum(int(np.prod(shape)) for shape in shapes)
         if total <= self.context.resources.max_memory * DERIVATIVES_SHARE:
             return lambda shape: np.zeros(shape, np.float32)
@@ -339,7 +375,8 @@ def fitted_on_hull(fit: HalfVectorFit, folder: Path) -> ImageFit:
     """Fit from nothing: to the samples, then to the photographs."""
     check_lights(fit.context)
     blocks = fit.context.blocks(folder)
-    stored = blocks.once("fit to the samples", lambda: arrays_of(fit.to_samples()))
+    n_lobes = fit.n_lobes(folder)
+    stored = blocks.once("fit to the samples", lambda: arrays_of(fit.to_samples(n_lobes)))
     return _to_photographs(fit, HalfVectorModel(**stored), folder)
 
 
@@ -364,6 +401,12 @@ def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) ->
     return ImageFit(HalfVectorModel(**stored), information, residual)
 
 
+def lobe_counts(fit: HalfVectorFit, folder: Path) -> dict[str, Any]:
+    """What the number of lobes was found by, for the record of a stage."""
+    errors = fit.lobe_errors(folder)
+    return {LOBE_ERRORS: errors.round(6).tolist()} if len(errors) else {}
+
+
 def stored_half_vector(context: Context) -> HalfVectorModel:
     """Model of the stage "compression" before it was quantised, in units of white."""
     stored: dict[str, Any] = results.arrays(context, "compression", MODEL)
@@ -375,7 +418,8 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     """Fit a half-vector model, write its field, and measure it on the samples."""
     context = context.refined
     fit = HalfVectorFit(context)
-    model = (fitted_on_surface if context.on_surface else fitted_on_hull)(fit, folder).model
+    on_hull = not context.on_surface
+    model = (fitted_on_hull if on_hull else fitted_on_surface)(fit, folder).model
     made = fit.made(model)
     write_field(folder / "field.rfld", made)
     write_model(folder / MODEL, model, fit.white)
@@ -391,6 +435,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
+        **(lobe_counts(fit, folder) if on_hull else {}),
         **made.counts,
         "field bytes": size,
         "raw bytes": raw,

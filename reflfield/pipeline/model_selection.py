@@ -12,10 +12,12 @@ import numpy as np
 
 from reflfield.errors import InputError
 from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR, MOST_SAMPLES
+from reflfield.fitting.lobe_count import fewest_lobes
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import StageFolder, plain
 from reflfield.pipeline.comparison import MAIN
 from reflfield.pipeline.context import AUTO, Context
+from reflfield.pipeline.half_vector_fit import LOBE_ERRORS
 from reflfield.pipeline.pipeline_options import ComparisonOptions, PipelineOptions
 from reflfield.util.folders import link_folder
 
@@ -27,7 +29,7 @@ SELECTION = "selection.json"
 # that of the mean of four by half as much.
 CHANCE_DB = 1.0
 VISIBILITY, FIT = "resampling.visibility", "compression.fit"
-MODEL = "compression.model"
+MODEL, LOBES = "compression.model", "compression.half_vector.n_lobes"
 # Samples of a texel, on average, that the half-vector model takes at least: below, frames and
 # colours of a texel are hardly determined.
 LEAST_HALF_VECTOR = 64
@@ -332,10 +334,24 @@ def sentences(context: Context) -> Iterator[str]:
             f"the half-vector model takes {LEAST_HALF_VECTOR} to {MOST_SAMPLES} of a solid "
             "object under known lights."
         )
+    errors = _lobe_errors(context)
+    if errors:
+        values = ", ".join(f"{value:.4f}" for value in errors)
+        yield (
+            f'{LOBES} = "auto" selected {fewest_lobes(errors)}: with 1, 2 and more lobes the '
+            f"weighted error of samples of views left out of the field is {values}."
+        )
     if asked.compression.fit == AUTO and options.compression.fit != AUTO:
         both = compared and len({c.fit for c in selection(context).candidates}) > 1
         why = _measured(context) if both else _rule(context)
         yield f'{FIT} = "auto" selected "{options.compression.fit}": {why}.'
+
+
+def _lobe_errors(context: Context) -> list[float]:
+    """Errors that the number of lobes was found by; none where it was not."""
+    stages = (context.stages.record(name) for name in ("surface", "compression"))
+    records = (record.counts.get(LOBE_ERRORS) for record in stages if record is not None)
+    return next((errors for errors in records if errors), [])
 
 
 def _measured(context: Context) -> str:

@@ -23,7 +23,13 @@ from reflfield.geometry.uv_atlas import Atlas
 from reflfield.pipeline import results
 from reflfield.pipeline.atlas import write_atlas_arrays
 from reflfield.pipeline.context import Context
-from reflfield.pipeline.half_vector_fit import MODEL, HalfVectorFit, fitted_on_hull, write_model
+from reflfield.pipeline.half_vector_fit import (
+    MODEL,
+    HalfVectorFit,
+    fitted_on_hull,
+    lobe_counts,
+    write_model,
+)
 from reflfield.pipeline.indirect import write_indirect
 from reflfield.pipeline.observations import lost_observations, write_observations
 from reflfield.pipeline.visibility import write_visibility
@@ -52,6 +58,7 @@ def write_surface(context: Context, folder: Path) -> dict[str, Any]:
     return {
         "mean displacement": float(np.abs(height).mean()),
         "texels at anchors": int((anchors > 0.5).sum()),
+        **lobe_counts(fit, folder),
     }
 
 
