@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -131,6 +133,28 @@ def processes(tmp_path_factory):
     yield start
     for cluster in running:
         cluster.stop()
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """Function that returns a folder filled once for all workers of the tests. Read only.
+
+    The first that asks for `name` calls `fill(folder)`, the others wait. What it returns, in
+    JSON, comes with the folder; a `fill` that fails is tried again by the next.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def make(name, fill):
+        path, returned = shared / name, shared / f"{name}.json"
+        with (shared / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if not returned.is_file():
+                shutil.rmtree(path, ignore_errors=True)
+                returned.write_text(json.dumps(fill(path)))
+        return path, json.loads(returned.read_text())
+
+    return make
 
 
 @pytest.fixture(scope="session")

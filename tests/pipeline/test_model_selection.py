@@ -66,11 +66,13 @@ def run_auto(tiny_capture, tiny_options):
 
 
 @pytest.fixture(scope="module")
-def selected_run(run_auto, tmp_path_factory):
+def selected_run(run_auto, made_once):
     """Folder of a finished run with both options "auto". Read only: copy it to change it."""
-    out = tmp_path_factory.mktemp("selected_run") / "out"
-    run_auto(out, *AUTO)
-    return out
+
+    def fill(folder):
+        run_auto(folder, *AUTO)
+
+    return made_once("selected_run", fill)[0]
 
 
 @pytest.fixture
