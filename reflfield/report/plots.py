@@ -184,8 +184,8 @@ def _drawn(
             axes.legend()
         stream = io.BytesIO()
         drawing.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
-    pixels = (round(inches * PIXELS_PER_INCH) for inches in size)
-    return Picture(stream.getvalue(), "image/svg+xml", *pixels, is_plot=True)
+    width_px, height_px = (round(inches * PIXELS_PER_INCH) for inches in size)
+    return Picture(stream.getvalue(), "image/svg+xml", width_px, height_px, is_plot=True)
 
 
 def _scale(axes: Any, axis: str, is_logarithmic: bool) -> None:
