@@ -86,7 +86,7 @@ def with_effect(scene: Scene, name: str) -> Scene:
 def score(capture: Path, out: Path, options: PipelineOptions, workers: int) -> dict:
     """Run the pipeline and compare its field with the truth."""
     resources = Resources(workers=workers)
-    job = run(open_capture(capture), out, options, resources=resources, last="comparison")
+    job = run(open_capture(capture), out, options, resources=resources, until="comparison")
     truth = open_truth(capture)
     field = open_field(job.stages.root / "compression" / "field.rfld")
     compared = comparison.comparison_of(job, "truth")

@@ -308,13 +308,13 @@ def _compression_section(context: Context) -> Section:
     return sections.compression_section({**parts, "header, names": rest}, raw_bytes(context))
 
 
-def _stage(record: Any) -> sections.StageRecord:
+def _stage(record: Any) -> sections.StageSummary:
     counts = {k: v for k, v in record.counts.items() if isinstance(v, int)}
-    return sections.StageRecord(
+    return sections.StageSummary(
         name=record.name,
         seconds=record.seconds,
         peak_bytes=record.peak_bytes,
-        outputs=counts,
+        counts=counts,
         size_bytes=record.size_bytes,
         reused=record.reused,
     )

@@ -201,7 +201,7 @@ class TestSecondRun:
             "-"
         )
         asked = (f"resampling.visibility={shadows}", f"compression.fit={fit}")
-        run_auto(selected_copy, *asked, last="comparison")
+        run_auto(selected_copy, *asked, until="comparison")
         assert computed_here(selected_copy) == []
 
     def test_accounts_add_up_with_shadows_the_other_way(self, selected_copy, run_auto):
@@ -214,7 +214,7 @@ class TestSecondRun:
     @pytest.mark.slow
     def test_from_model_selection_computes_the_candidates_again(self, selected_copy, run_auto):
         before = (selected_copy / "field.rfld").read_bytes()
-        run_auto(selected_copy, *AUTO, first="model_selection", last="comparison")
+        run_auto(selected_copy, *AUTO, from_stage="model_selection", until="comparison")
         after = STAGES[STAGES.index("model_selection") : STAGES.index("without_alignment")]
         if records(selected_copy)["model_selection"]["counts"]["selected"].startswith("kept"):
             after = [stage for stage in after if stage != "indirect"]
@@ -227,7 +227,7 @@ class TestSecondRun:
 
     def test_from_a_later_stage_keeps_the_selection(self, selected_copy, run_auto):
         before = stamps(selected_copy / "candidates")
-        run_auto(selected_copy, *AUTO, first="compression", last="compression")
+        run_auto(selected_copy, *AUTO, from_stage="compression", until="compression")
         assert computed_here(selected_copy) == ["compression"]
         assert stamps(selected_copy / "candidates") == before
 
@@ -260,16 +260,16 @@ def test_killed_in_a_candidate_run_it_goes_on_there(
 def test_no_candidate_run_before_it_matters(selected_copy, run_auto):
     shutil.rmtree(selected_copy / "candidates")
     shutil.rmtree(selected_copy / "stages" / "model_selection")
-    run_auto(selected_copy, *AUTO, last="observations")
+    run_auto(selected_copy, *AUTO, until="observations")
     compression = ("compression.fit=auto", "compression.model=clustered")
-    run_auto(selected_copy, "resampling.visibility=kept", *compression, last="resampling")
+    run_auto(selected_copy, "resampling.visibility=kept", *compression, until="resampling")
     assert not (selected_copy / "candidates").exists()
     assert "selected" not in (selected_copy / "options.toml").read_text()
 
 
 def test_without_photographs_the_number_of_samples_decides_and_says_so(run_auto, tmp_path):
     kept = ("resampling.visibility=kept", AUTO[1])
-    context = run_auto(tmp_path, *kept, hold_out=HoldOut(), last="compression")
+    context = run_auto(tmp_path, *kept, hold_out=HoldOut(), until="compression")
     assert context.options.compression.fit == "samples"
     assert open_field(tmp_path / "field.rfld").metadata["options"]["compression"]["fit"] == (
         "samples"
@@ -283,7 +283,7 @@ def test_without_photographs_the_number_of_samples_decides_and_says_so(run_auto,
 def test_photographs_held_out_one_by_one_decide_too(run_auto, tmp_path, tiny_capture):
     kept = ("resampling.visibility=kept", AUTO[1])
     held = HoldOut(photographs=3)
-    context = run_auto(tmp_path, *kept, hold_out=held, last="compression")
+    context = run_auto(tmp_path, *kept, hold_out=held, until="compression")
     psnr = {}
     for name in ("samples", "grid"):
         compared = tmp_path / "stages" / "model_selection" / name / "heldout.json"
@@ -458,7 +458,7 @@ def test_shadows_are_treated_as_the_object_needs(better, run_auto, tmp_path):
         *grids,
         capture=capture,
         hold_out=HoldOut(views=1, lights=n_lights),
-        last="compression",
+        until="compression",
     )
     print(context.stages.record("model_selection").counts["heldout PSNR, dB"])
     assert context.options.resampling.visibility == better

@@ -78,7 +78,7 @@ def error_of(clipped, exposed, tiny_options, folder):
     """Root mean square of the field's error on an unseen photograph that is not clipped."""
     options = with_tables(PipelineOptions(), tomllib.loads(tiny_options.read_text()))
     context = run(
-        clipped, folder, options, hold_out=HoldOut(views=1, lights=1), last="compression"
+        clipped, folder, options, hold_out=HoldOut(views=1, lights=1), until="compression"
     )
     frames, unclipped = context.held_out, open_capture(exposed)
     field, squares = open_field(folder / "field.rfld"), []

@@ -148,12 +148,12 @@ def test_turned_frames_show_their_tilt(samples):
 def test_stage_times_add_up_and_reuse_is_said():
     section = sections.stages_section(
         [
-            sections.StageRecord("hull", 61.0, inputs={"views": 32}, outputs={"faces": 20_000}),
-            sections.StageRecord("atlas", 4.0, peak_bytes=10**9, reused=True),
+            sections.StageSummary("hull", 61.0, counts={"views": 32, "faces": 20_000}),
+            sections.StageSummary("atlas", 4.0, peak_bytes=10**9, reused=True),
         ]
     )
     rows = tables(section)[0].rows
-    assert rows[0] == ("hull", "1 min 01 s", None, "32 views", "20\u202f000 faces", None)
+    assert rows[0] == ("hull", "1 min 01 s", None, "32 views, 20\u202f000 faces", None)
     assert rows[1][:3] == ("atlas (reused)", "4.0 s", "1 GB")
     assert rows[2][1] == "1 min 05 s"
 
