@@ -37,6 +37,11 @@ FILES = (
 )
 
 
+# Of the held-out photograph of the tiny ball, at every size. 17.5 to 19.1 was measured; its mean
+# colour all over scores 12.5, black 9.9.
+LEAST_HELDOUT_DB = 15.0
+
+
 def texels_of(folder):
     with np.load(folder / "stages" / "atlas" / "atlas.npz") as stored:
         arrays = dict(stored)
@@ -150,12 +155,12 @@ class TestWhatARunLeaves:
         }
         ours, other = (counts[name] for name in ("compression", "without_alignment"))
         assert "With alignment and without" in page
-        for found in (ours, other):
-            assert f"{100 * found['relative error of the samples']:.2f}" in page
-            assert found["clusters"] == ours["clusters"]
-            assert found["components"] == ours["components"]
-            assert abs(found["field bytes"] - ours["field bytes"]) < 0.02 * ours["field bytes"]
-            assert found["samples measured"] == ours["samples measured"] > 1000
+        for field in (ours, other):
+            assert f"{100 * field['relative error of the samples']:.2f}" in page
+            assert field["clusters"] == ours["clusters"]
+            assert field["components"] == ours["components"]
+            assert abs(field["field bytes"] - ours["field bytes"]) < 0.02 * ours["field bytes"]
+            assert field["samples measured"] == ours["samples measured"] > 1000
         assert {"heldout PSNR, dB", "heldout PSNR without alignment, dB"} <= set(
             counts["comparison"]
         )
@@ -178,7 +183,7 @@ class TestWhatARunLeaves:
             assert sizes == sorted(sizes, reverse=True)
             # The coarsest is worse than the finest; in between, noise may help by chance.
             assert quality[-1] < quality[0] - 0.5
-        assert all(p["heldout_db"] > 5 for p in points)
+        assert all(p["heldout_db"] > LEAST_HELDOUT_DB for p in points)
         assert "Quality against size" in (finished.folder / "report" / "index.html").read_text()
 
     def test_results_on_stdout_and_only_progress_on_stderr(self, finished):
@@ -273,9 +278,9 @@ class TestSecondRun:
             run_tiny(run_copy, "--psnr", f"{wanted:.2f}", "--until", "compression").status == 0
         )
         records = json.loads((run_copy / "timings.json").read_text())["stages"]
-        (found,) = (r["counts"] for r in records if r["name"] == "compression")
-        assert found["LDR PSNR of the samples, dB"] >= wanted - 0.05
-        assert found["field bytes"] < made["field bytes"]
+        (smaller,) = (r["counts"] for r in records if r["name"] == "compression")
+        assert smaller["LDR PSNR of the samples, dB"] >= wanted - 0.05
+        assert smaller["field bytes"] < made["field bytes"]
 
     def test_a_quality_that_is_not_reached_is_said_and_has_a_status_of_its_own(
         self, run_copy, run_tiny

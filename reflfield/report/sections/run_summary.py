@@ -163,8 +163,8 @@ def stages_section(stages: Sequence[StageSummary]) -> Section:
     table = Table(
         ("stage", "wall time", "peak memory", "counts", "on disk"),
         (*rows, ("total", format_seconds(total), None, None, None)),
-        "Counts of what went into each stage and came out. Reused stages show the wall time of the run that "
-        "computed them.",
+        "Counts of what went into each stage and came out. Reused stages show the wall time of "
+        "the run that computed them.",
         emphasised=(len(rows),),
     )
     plot = plots.bars([s.name for s in stages], [s.seconds for s in stages], "seconds")
