@@ -7,8 +7,8 @@ from reflfield.alignment.frame_ambiguity import mean_rotation
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.rotations import frames_from_normals
 
-
-# Mean error of refined normals, degrees: .030 was measured on clean samples, .033 with 2 % noise.
+# Mean error of refined normals, degrees: .030 was measured on clean samples, .033 with 2 % of
+# noise.
 FINE_DEG = 0.06
 
 

@@ -297,8 +297,8 @@ def test_demo(subprocess_run, tmp_path):
     assert (out / "capture" / "capture.json").is_file()
     metrics = json.loads((out / "metrics.json").read_text())
     assert len(metrics["frames"]) == 4
-    # 30.7 was measured (tests/benchmarks/results/capture_demo.json), 28.9 with one lobe of three,
-    # 26.8 with the clustered model.
+    # 30.7 was measured (tests/benchmarks/results/capture_demo.json), 28.9 with one lobe of
+    # three, 26.8 with the clustered model.
     assert metrics["mean"]["psnr_ldr"] > 29.5
 
 

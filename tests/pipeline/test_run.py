@@ -37,8 +37,8 @@ FILES = (
 )
 
 
-# Of the held-out photograph of the tiny ball, at every size. 17.5 to 19.1 was measured; its mean
-# colour all over scores 12.5, black 9.9.
+# Of the held-out photograph of the tiny ball, at every size. 17.5 to 19.1 was measured; its
+# mean colour all over scores 12.5, black 9.9.
 LEAST_HELDOUT_DB = 15.0
 
 
