@@ -46,8 +46,12 @@ def write_report_page(context: Context, folder: Path) -> dict[str, Any]:
         context, field, results.arrays(context, "maps", AVERAGES)["average"], scores
     )
     write_report(folder / "index.html", content)
-    problems = scores.problems if scores is not None else ()
-    return {"sections": len(content.sections), comparison.PROBLEMS: list(problems)}
+    scores = scores or TruthScores()
+    return {
+        "sections": len(content.sections),
+        **scores.counts(),
+        comparison.PROBLEMS: list(scores.problems),
+    }
 
 
 def report_content(
