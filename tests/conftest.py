@@ -62,8 +62,8 @@ class Processes:
 
     def __init__(self, folder, paths):
         self.folder, self.started = folder, []
-        found = os.pathsep.join(filter(None, [*map(str, paths), os.environ.get("PYTHONPATH")]))
-        self.environment = {**os.environ, "PYTHONPATH": found}
+        places = [*map(str, paths), os.environ.get("PYTHONPATH")]
+        self.environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
         named = folder / "scheduler.json"
         words = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--no-show")
         self.scheduler = self.start("scheduler", *words, "--scheduler-file", named)

@@ -146,8 +146,8 @@ class TestWhatACandidateRunLeaves:
             assert f"{metrics['flip']:.4f}" in row
             assert f'alt="{name}"' in section
             assert f'alt="FLIP error {name}"' in section
-        taken = records(selected_run)["model_selection"]["counts"]["selected"]
-        assert f'<tr class="emphasised"><td>{taken}</td>' in section
+        selected = records(selected_run)["model_selection"]["counts"]["selected"]
+        assert f'<tr class="emphasised"><td>{selected}</td>' in section
         assert "unseen views and lights, which had no part in the selection" in section
 
     def test_stages_before_what_is_auto_are_shared(self, selected_run):
@@ -163,18 +163,18 @@ class TestWhatACandidateRunLeaves:
             assert len(inodes) == n_made, stage
 
     def test_time_counts_every_stage_once(self, selected_run):
-        found = {}
+        seconds = {}
         for root in (selected_run / "stages", *selected_run.glob("candidates/*/stages")):
             for path in root.glob("*/stage.json"):
                 record = json.loads(path.read_text())
                 if record["name"] != "model_selection":
-                    found[record["name"], record["key"]] = record["seconds"]
+                    seconds[record["name"], record["key"]] = record["seconds"]
         # The report's own time is known when it is done.
         timings = json.loads((selected_run / "timings.json").read_text())
-        assert timings["seconds"] == pytest.approx(sum(found.values()), rel=1e-9)
+        assert timings["seconds"] == pytest.approx(sum(seconds.values()), rel=1e-9)
         # Before what is "auto", for each visibility (and what its shadows show, if they are
         # traced), for each fit in it, the maps and the report.
-        assert len(found) == 6 + 2 * 3 + 1 + 4 * 2 + 2
+        assert len(seconds) == 6 + 2 * 3 + 1 + 4 * 2 + 2
 
     def test_options_are_as_asked_with_the_selection_above(self, selected_run):
         text = (selected_run / "options.toml").read_text()
@@ -205,8 +205,8 @@ class TestSecondRun:
         assert computed_here(selected_copy) == []
 
     def test_accounts_add_up_with_shadows_the_other_way(self, selected_copy, run_auto):
-        taken = records(selected_copy)["model_selection"]["counts"]["selected"]
-        other = "kept" if taken.startswith("factored") else "factored"
+        selected = records(selected_copy)["model_selection"]["counts"]["selected"]
+        other = "kept" if selected.startswith("factored") else "factored"
         run_auto(selected_copy, f"resampling.visibility={other}", "compression.fit=grid")
         page = (selected_copy / "report" / "index.html").read_text()
         assert "not accounted for." not in page
@@ -383,7 +383,7 @@ class TestCandidates:
 
 
 @pytest.mark.parametrize(
-    ("psnr", "taken"),
+    ("psnr", "best"),
     [
         # Of equal ones the first, whatever comes later.
         ({"a": [20.0, 22.0], "b": [20.0, 22.0]}, "a"),
@@ -400,8 +400,8 @@ class TestCandidates:
         ({"a": [20.0], "b": [20.5], "c": [21.2]}, "c"),
     ],
 )
-def test_a_lead_beyond_chance_is_needed(psnr, taken):
-    assert model_selection.clearly_best(psnr) == taken
+def test_a_lead_beyond_chance_is_needed(psnr, best):
+    assert model_selection.clearly_best(psnr) == best
 
 
 RIG = {

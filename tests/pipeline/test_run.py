@@ -314,9 +314,10 @@ class TestSecondRun:
         assert "size: expected at least" in outcome.err
 
     def test_without_the_comparison_the_field_is_the_same(self, run_copy, run_tiny, finished):
-        off = ("--set", "comparison.without_alignment=false")
+        names = ("without_alignment", "rate_distortion")
+        off = [word for name in names for word in ("--set", f"comparison.{name}=false")]
         assert run_tiny(run_copy, *off, "--from", "compression").status == 0
-        assert "without_alignment" not in states(run_copy)
+        assert not set(names) & set(states(run_copy))
         assert digest(run_copy / "field.rfld") == digest(finished.folder / "field.rfld")
         page = (run_copy / "report" / "index.html").read_text()
         assert "With alignment and without" not in page
