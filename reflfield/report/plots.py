@@ -22,9 +22,9 @@ from reflfield.report.page import Picture
 SERIES_COLOURS = ("#1f5fbf", "#e07b1a", "#3c9d5b", "#8f3f97", "#6b7280")
 SIZE_INCHES = (5.6, 3.1)
 PIXELS_PER_INCH = 96
-# Around the axes, in inches: numbers of six digits and the axis' label. Fixed, as a layout that
-# measures them draws every plot twice.
-LEFT, RIGHT, BOTTOM, TOP = 0.76, 0.2, 0.52, 0.12
+# Around the axes, in inches: numbers of six digits, a power of ten above, labels. Fixed, as a
+# layout that measures them draws every plot twice.
+LEFT, RIGHT, BOTTOM, TOP = 0.76, 0.2, 0.52, 0.16
 # Of names left of bars: the mean width of a letter, and the most that they may take.
 INCHES_PER_LETTER = 0.078
 WIDEST_NAMES = 3.0

@@ -210,6 +210,37 @@ def test_histogram_counts_everything_in_percent():
     assert (picture.width, picture.height) == (538, 298)
 
 
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plots.bars(["held_out_silhouettes", "hull"], [12345.6, 1.0], "seconds"),
+        lambda: plots.bars(["hull"], [0.5], "seconds"),
+        lambda: plots.lines({"a": ([1, 2], [0, 987654])}, "iteration", "score"),
+        lambda: plots.lines(
+            {"a": ([0.05, 20], [1e-4, 1])}, "MB", "error", log_x=True, log_y=True
+        ),
+        lambda: plots.histogram({"a": np.linspace(-1e-4, 1e-4, 99)}, "mm", "points, %"),
+    ],
+    ids=["bars", "bar", "lines", "logarithmic", "histogram"],
+)
+def test_texts_of_plots_fit_their_margins(draw, monkeypatch):
+    drawings = []
+
+    class Kept(plots.Drawing):
+        def __init__(self, **named):
+            super().__init__(**named)
+            drawings.append(self)
+
+    monkeypatch.setattr(plots, "Drawing", Kept)
+    draw()
+    (drawing,) = drawings
+    box, (width, height) = drawing.get_tightbbox(), drawing.get_size_inches()
+    assert box.x0 >= 0
+    assert box.y0 >= 0
+    assert box.x1 <= width
+    assert box.y1 <= height
+
+
 def test_accounts_that_do_not_add_up_are_said():
     whole = sections.CountedItems("capture", "photographs", 5, {"used": 3, "held out": 2})
     lost = sections.CountedItems("alignment", "texels", 9, {"frame found": 7})
