@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -22,6 +21,13 @@ import numpy as np
 import psutil
 import pytest
 
+try:
+    import fcntl
+except ImportError:  # Windows: each worker makes what it needs
+    fcntl = None
+
+# Scripts without doctests, which import much.
+collect_ignore = ["benchmarks"]
 SEED = 20060905  # one seed for all; change it with --seed
 
 
@@ -143,12 +149,13 @@ def made_once(tmp_path_factory):
     JSON, comes with the folder; a `fill` that fails is tried again by the next.
     """
     base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    shared = base.parent if fcntl and "PYTEST_XDIST_WORKER" in os.environ else base
 
     def make(name, fill):
         path, returned = shared / name, shared / f"{name}.json"
         with (shared / f"{name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if fcntl:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
             if not returned.is_file():
                 shutil.rmtree(path, ignore_errors=True)
                 returned.write_text(json.dumps(fill(path)))
