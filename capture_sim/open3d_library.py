@@ -60,6 +60,8 @@ class _ImportedWhenUsed:
     """Stands for the module `open3d`."""
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # who looks what kind of thing this is, uses nothing of it
+            raise AttributeError(name)
         return getattr(load_open3d(), name)
 
 

@@ -32,7 +32,7 @@ from capture_sim.effects import (
 from capture_sim.materials import Material
 from capture_sim.model import Scene
 from capture_sim.rays import RayTracer, towards_camera
-from capture_sim.shading import BYTES_PER_PAIR, direct_light
+from capture_sim.shading import BYTES_PER_PAIR, add_direct_light, direct_light
 from capture_sim.surface import SurfacePoints
 from capture_sim.view_samples import ViewSamples
 from capture_sim.visibility import Nodes, TracedLights, trace_lights, worth_tracing
@@ -200,7 +200,8 @@ def _lit_pixels(
         points, weight = view.points[block], view.weight[block].astype(np.float32)
         views = towards_camera(view.camera, points.position)
         values, strength = direct_light(scene, tracer, points, views, arrays, traced)
-        _gather(values, strength, colour, row[block], weight, radiance)
+        weights = np.repeat(weight[:, None], 3, axis=1)
+        add_direct_light(values, strength, colour, row[block], weights, radiance)
         for effect in between:
             with scene.costs.measure(effect.NAME):
                 more = effect.apply(scene, tracer, points, views, arrays, traced)
@@ -212,26 +213,6 @@ def _lit_pixels(
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _Values = NDArray[Any]
-
-
-@_compiled
-def _gather(
-    values: _Values,
-    strength: _Values,
-    colour: _Values,
-    row: _Values,
-    weight: _Values,
-    radiance: _Values,
-) -> None:
-    """Add the points' light (n, 3, n_lights) to that of their pixels."""
-    number = radiance.dtype.type
-    for n in range(len(values)):
-        for c in range(3):
-            for k in range(strength.shape[1]):
-                # Values of lights that do not count may be anything, even NaN.
-                if strength[n, k] > 0.0:
-                    shining = number(values[n, c, k] * strength[n, k])
-                    radiance[row[n], c, k] += weight[n] * colour[c, k] * shining
 
 
 @_compiled

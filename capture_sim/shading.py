@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,3 +70,37 @@ def direct_light(
     strength *= np.where(lit, cosine, 0)
     local_views = local_views.astype(precision)
     return scene.material.evaluate_lights(local_views, directions, lit, points.uv), strength
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_direct_light(
+    values: NDArray[Any],
+    strength: NDArray[Any],
+    colour: NDArray[Any],
+    row: NDArray[Any],
+    weight: NDArray[Any],
+    radiance: NDArray[Any],
+) -> None:
+    """Add the light of points to rows of `radiance`, such as pixels or starts of paths.
+
+    Parameters
+    ----------
+    values : (n, 3, n_lights) float
+        BRDF, see `direct_light`; of lights that do not count anything, even NaN.
+    strength : (n, n_lights) float
+        Irradiance but for the colour; lights of zero do not count.
+    colour : (3, n_lights) float
+    row : (n,) int
+        Where each point's light goes.
+    weight : (n, 3) float
+        What it is multiplied by.
+    radiance : (n_rows, 3, n_lights) float
+        Changed in place.
+    """
+    number = radiance.dtype.type
+    for n in range(len(values)):
+        for c in range(3):
+            for k in range(strength.shape[1]):
+                if strength[n, k] > 0.0:
+                    shining = number(values[n, c, k] * strength[n, k])
+                    radiance[row[n], c, k] += weight[n, c] * colour[c, k] * shining

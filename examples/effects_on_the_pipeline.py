@@ -30,6 +30,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from benchmarks.measuring import Results
 
+import reflfield as rf
 from capture_sim.effects import (
     dropped_photographs,
     environment,
@@ -40,13 +41,6 @@ from capture_sim.effects.registry import EFFECTS
 from capture_sim.model import Scene
 from capture_sim.scene import load_scene
 from capture_sim.write import write_capture
-from reflfield.capture.readers import open_capture
-from reflfield.field.file import open_field
-from reflfield.metrics.truth_files import open_truth
-from reflfield.options import Resources, read_toml, with_tables
-from reflfield.pipeline import comparison, truth_comparison
-from reflfield.pipeline.pipeline_options import PipelineOptions
-from reflfield.pipeline.stages import run
 
 NOTHING = "none"
 # What every capture has: these make the image, they do not spoil it.
@@ -60,16 +54,18 @@ PARAMETERS = (
     dropped_photographs.Options(fraction=0.1),
 )
 # A coarse field, fitted in few rounds: twenty of them are made.
-OPTIONS = {
-    "texture": {"texels_per_pixel": 0.6},
-    "alignment": {"iterations": 2},
-    "compression": {"samples": {"rounds": 2, "iterations": 6}},
-}
+OPTIONS = (
+    "texture.texels_per_pixel=0.6",
+    "alignment.iterations=2",
+    "compression.samples.rounds=2",
+    "compression.samples.iterations=6",
+)
+# What a run says of its field, by the names of its counts, and how tables call it.
 COLUMNS = {
-    "psnr": "PSNR, dB",
-    "hull_mm": "hull error, mm",
-    "normal_deg": "normals, degrees",
-    "tangent_deg": "tangents, degrees",
+    "truth PSNR, dB": "PSNR, dB",
+    "hull to the truth, mm": "hull error, mm",
+    "normals to the truth, degrees": "normals, degrees",
+    "tangents to the truth, degrees": "tangents, degrees",
 }
 
 
@@ -83,32 +79,18 @@ def with_effect(scene: Scene, name: str) -> Scene:
     return replace(scene, effects=choice)
 
 
-def score(capture: Path, out: Path, options: PipelineOptions, workers: int) -> dict:
-    """Run the pipeline and compare its field with the truth."""
-    resources = Resources(workers=workers)
-    job = run(open_capture(capture), out, options, resources=resources, last="comparison")
-    truth = open_truth(capture)
-    field = open_field(job.stages.root / "compression" / "field.rfld")
-    compared = comparison.comparison_of(job, "truth")
-    frames, _ = truth_comparison.frame_scores(job, truth, field)
-    return {
-        "psnr": compared.mean["psnr_ldr"],
-        "hull_mm": truth_comparison.hull_score(job, truth).summary()["mean_mm"],
-        "normal_deg": frames.summary()["normal_median_deg"],
-        "tangent_deg": frames.summary()["tangent_median_deg"],
-    }
-
-
-def measure(scene: Scene, name: str, out: Path, options: PipelineOptions, workers: int) -> None:
+def measure(scene: Scene, name: str, out: Path, options: rf.PipelineOptions, workers: int):
     """Simulate, process and score one effect, unless that has been done."""
     folder = out / name
     if (folder / "result.json").is_file():
         return
-    capture = write_capture(
-        with_effect(scene, name), folder / "capture", workers=workers, overwrite=True
-    )
-    result = score(capture, folder / "run", options, workers)
-    (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n")
+    spoilt = with_effect(scene, name)
+    capture = write_capture(spoilt, folder / "capture", workers=workers, overwrite=True)
+    resources = rf.Resources(workers=workers)
+    result = rf.reconstruct(capture, folder / "run", options=options, resources=resources)
+    counts = {key: value for stage in result.stages for key, value in stage.counts.items()}
+    scores = {key: counts[key] for key in COLUMNS}
+    (folder / "result.json").write_text(json.dumps(scores, indent=1) + "\n")
     for part in ("capture", "run"):
         shutil.rmtree(folder / part)
 
@@ -150,7 +132,7 @@ def plot(results: dict[str, dict], path: Path) -> None:
             axis.axvspan(min(values), max(values), color="tab:orange", alpha=0.4)
         if NOTHING in results:
             axis.axvline(results[NOTHING][key], color="black", linewidth=1)
-        if key == "psnr":
+        if title.startswith("PSNR"):
             values = [result[key] for result in results.values()]
             axis.set_xlim(min(values) - 1, max(values) + 0.5)
         axis.set_title(title)
@@ -170,16 +152,13 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
 
-    tables = read_toml(arguments.config) if arguments.config else OPTIONS
-    options = with_tables(PipelineOptions(), tables)
+    options = rf.read_options(arguments.config, () if arguments.config else OPTIONS)
     scene = load_scene(arguments.scene)
     for name in [NOTHING, *HARMLESS, *arguments.effects.split(",")]:
         measure(scene, name, arguments.out, options, arguments.workers)
     order = [NOTHING, *HARMLESS, *names]
-    found = {
-        p.parent.name: json.loads(p.read_text()) for p in arguments.out.glob("*/result.json")
-    }
-    results = {name: found[name] for name in order if name in found}
+    files = {name: arguments.out / name / "result.json" for name in order}
+    results = {n: json.loads(path.read_text()) for n, path in files.items() if path.is_file()}
     (arguments.out / "effects.md").write_text(table(results))
     plot(results, arguments.out / "effects.png")
     print(table(results))

@@ -15,25 +15,29 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from reflfield.capture.readers import open_capture
-from reflfield.field.file import open_field
-from reflfield.render.exposure import encoded_picture
-from reflfield.render.renderer import render
+import reflfield as rf
 
 GAP = 8  # pixels between the two images
 
 
+def encoded(image: np.ndarray, brightest: float) -> Image.Image:
+    """Picture of linear radiance, in sRGB."""
+    linear = np.clip(image / brightest, 0.0, 1.0)
+    curve = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+    return Image.fromarray((255 * curve).round().astype(np.uint8))
+
+
 def side_by_side(capture_path: Path, run: Path, number: int, size: int) -> Image.Image:
     """Photograph and rendered image of one held-out frame."""
-    capture, field = open_capture(capture_path), open_field(run / "field.rfld")
+    capture, field = rf.open_capture(capture_path), rf.open_field(run / "field.rfld")
     name = json.loads((run / "metrics.json").read_text())["frames"][number]["name"]
     index = [photograph.name for photograph in capture.photographs].index(name)
-    taken = capture.photographs[index]
+    described = capture.photographs[index]
     photograph = capture.read_photograph(index)
-    rendered = render(field, capture.cameras[taken.camera], capture.lights[taken.light]).image
-    exposure = 1.0 / float(np.percentile(photograph.max(axis=2), 99.5))
+    rendered = field.render(capture.cameras[described.camera], capture.lights[described.light])
+    brightest = float(np.percentile(photograph.max(axis=2), 99.5))
     images = [
-        Image.fromarray(encoded_picture(image, exposure)).resize((size, size), Image.LANCZOS)
+        encoded(image, brightest).resize((size, size), Image.LANCZOS)
         for image in (photograph, rendered)
     ]
     both = Image.new("RGB", (2 * size + GAP, size), "white")

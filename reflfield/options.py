@@ -30,6 +30,11 @@ RENAMED_OPTIONS = {
     "compression.coarseness": "compression.relative_step",
     "compression.samples.fineness": "compression.samples.grid_refinement",
 }
+# Options that are gone, with what holds instead. They are ignored, with one line of warning,
+# until the next minor version: the `options.toml` of an earlier run lists every option.
+REMOVED_OPTIONS = {
+    "visibility.shadow_band": "no stage of a run has used it",
+}
 # A configuration file is written by hand: anything larger is another file.
 LARGEST_FILE = 1 << 20
 # Keys of very many parts take time and memory that grow with the square of their number.
@@ -150,11 +155,8 @@ def with_current_names(
     """
     result = dict(tables)
     for old, new in (RENAMED_OPTIONS if renamed is None else renamed).items():
-        *above, name = old.split(".")
-        holder: Any = result
-        for part in above:
-            holder = holder.get(part) if isinstance(holder, Mapping) else None
-        if isinstance(holder, Mapping) and name in holder:
+        holder, name = _holder_of(result, old)
+        if name in holder:
             log.warning(
                 "option %r is now %r; the old name is accepted until version 0.2",
                 *(old, new),
@@ -165,6 +167,29 @@ def with_current_names(
                 value = {part: value}
             result = merged(value, result)
     return result
+
+
+def without_removed(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return tables without the options of `REMOVED_OPTIONS`, saying so."""
+    result = dict(tables)
+    for gone, reason in REMOVED_OPTIONS.items():
+        holder, name = _holder_of(result, gone)
+        if name in holder:
+            log.warning(
+                "option %r is gone: %s; it is ignored until version 0.2, remove it",
+                *(gone, reason),
+            )
+            result = _without(result, gone.split("."))
+    return result
+
+
+def _holder_of(tables: Mapping[str, Any], option: str) -> tuple[Mapping[str, Any], str]:
+    """Table that an option would stand in, empty if there is none, and its name there."""
+    *above, name = option.split(".")
+    holder: Any = tables
+    for part in above:
+        holder = holder.get(part) if isinstance(holder, Mapping) else None
+    return (holder if isinstance(holder, Mapping) else {}), name
 
 
 def _without(tables: Mapping[str, Any], path: Sequence[str]) -> dict[str, Any]:
@@ -198,7 +223,7 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
         If a name is unknown (near names are suggested) or a value has the wrong type.
     """
     if not where:
-        tables = with_current_names(tables)
+        tables = without_removed(with_current_names(tables))
     hints = get_type_hints(type(options))
     known = [f.name for f in fields(options)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,13 @@ import numpy as np
 import psutil
 import pytest
 
+try:
+    import fcntl
+except ImportError:  # Windows: each worker makes what it needs
+    fcntl = None
+
+# Scripts without doctests, which import much.
+collect_ignore = ["benchmarks"]
 SEED = 20060905  # one seed for all; change it with --seed
 
 
@@ -60,8 +68,8 @@ class Processes:
 
     def __init__(self, folder, paths):
         self.folder, self.started = folder, []
-        found = os.pathsep.join(filter(None, [*map(str, paths), os.environ.get("PYTHONPATH")]))
-        self.environment = {**os.environ, "PYTHONPATH": found}
+        places = [*map(str, paths), os.environ.get("PYTHONPATH")]
+        self.environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, places))}
         named = folder / "scheduler.json"
         words = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--no-show")
         self.scheduler = self.start("scheduler", *words, "--scheduler-file", named)
@@ -131,6 +139,29 @@ def processes(tmp_path_factory):
     yield start
     for cluster in running:
         cluster.stop()
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """Function that returns a folder filled once for all workers of the tests. Read only.
+
+    The first that asks for `name` calls `fill(folder)`, the others wait. What it returns, in
+    JSON, comes with the folder; a `fill` that fails is tried again by the next.
+    """
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if fcntl and "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def make(name, fill):
+        path, returned = shared / name, shared / f"{name}.json"
+        with (shared / f"{name}.lock").open("w") as lock:
+            if fcntl:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if not returned.is_file():
+                shutil.rmtree(path, ignore_errors=True)
+                returned.write_text(json.dumps(fill(path)))
+        return path, json.loads(returned.read_text())
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -23,11 +23,17 @@ PROMISE = ROOT / "tests" / "data" / "public_api.txt"
 
 # What opening and evaluating a field does without, and rendering one.
 HEAVY = ("dask", "distributed", "matplotlib", "zarr", "trimesh", "rich", "typer", "skimage")
-HEAVIER = (*HEAVY, "open3d", "cv2", "OpenImageIO", "scipy.spatial", "scipy.sparse")
+HEAVIER = (
+    *HEAVY,
+    *("open3d", "cv2", "OpenImageIO", "scipy.spatial", "scipy.sparse", "PIL", "psutil"),
+    *("xatlas", "jsonschema", "fsspec", "flip_evaluator", "OpenEXR", "multiprocessing.pool"),
+)
 # What open3d itself does not import.
 NEVER = ("dask", "distributed", "zarr")
 # Seconds of the processor: six times what is asked for of an idle core, since work on the other
-# hardware threads doubles and trebles it.
+# hardware threads doubles and trebles it. Imports and opening took .42 s on a nearly idle
+# machine, .13 of them NumPy and .25 Numba with LLVM, which every kernel needs; .43 s more, on a
+# busy one, are the first evaluation, which loads compiled kernels.
 MOST_IMPORTING = 3.0
 
 

@@ -21,9 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,7 +34,7 @@ from capture_sim.materials.textures import Constant
 from capture_sim.model import Scene
 from capture_sim.objects import SurfaceMesh
 from capture_sim.rays import RayTracer, towards_camera
-from capture_sim.shading import direct_light
+from capture_sim.shading import add_direct_light, direct_light
 from capture_sim.surface import SurfacePoints, spread_points, surface_points
 from capture_sim.tables import bounded
 from capture_sim.visibility import TracedLights
@@ -252,7 +250,7 @@ def _traced_paths(
         )
         colour = lights.colour.T.astype(np.float32)
         throughput = paths.throughput.astype(np.float32)
-        _bring(values, strength, colour, throughput, paths.row, brought)
+        add_direct_light(values, strength, colour, paths.row, throughput, brought)
     return brought.reshape(n, options.paths, 3, len(lights))
 
 
@@ -284,29 +282,6 @@ def _next(
         throughput=(throughput / np.maximum(survival, 1e-300)[:, None])[chosen],
         row=paths.row[chosen],
     )
-
-
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-_Values = NDArray[Any]
-
-
-@_compiled
-def _bring(
-    values: _Values,
-    strength: _Values,
-    colour: _Values,
-    throughput: _Values,
-    row: _Values,
-    brought: _Values,
-) -> None:
-    """Add the direct light at the ends of paths (m, 3, n_lights) to what they bring."""
-    number = brought.dtype.type
-    for n in range(len(values)):
-        for c in range(3):
-            for k in range(strength.shape[1]):
-                if strength[n, k] > 0.0:
-                    shining = number(values[n, c, k] * strength[n, k])
-                    brought[row[n], c, k] += throughput[n, c] * colour[c, k] * shining
 
 
 @lru_cache(maxsize=8)

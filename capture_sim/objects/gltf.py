@@ -126,5 +126,7 @@ class FolderResolver(Resolver):  # type: ignore[misc]  # trimesh carries no type
         return FolderResolver(self._folder / namespace)
 
     def write(self, name: str, data: Any) -> None:
-        """Nothing is written."""
-        raise NotImplementedError
+        """Refuse: meshes are only read."""
+        raise scene_error(
+            str(self._folder / name), "a mesh that is only read", "one that writes files"
+        )

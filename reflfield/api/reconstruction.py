@@ -118,7 +118,11 @@ def reconstruct(
     if not isinstance(options, PipelineOptions):
         options = with_tables(PipelineOptions(), options or {})
     context = run(
-        capture, folder, options, hold_out=held, resources=limits, first=from_stage, last=until
+        *(capture, folder, options),
+        hold_out=held,
+        resources=limits,
+        from_stage=from_stage,
+        until=until,
     )
     return _result(context)
 

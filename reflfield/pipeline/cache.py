@@ -27,6 +27,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -308,6 +309,12 @@ def stage_key(name: str, options: Any, inputs: Mapping[str, str], code: str) -> 
 
 def versions() -> dict[str, str]:
     """Versions of this package and of what it computes with."""
+    return dict(_installed_versions())
+
+
+@cache
+def _installed_versions() -> dict[str, str]:
+    """Look them up once: each stage asks, and each lookup reads a package's description."""
     installed = {"reflfield": version("reflfield"), "python": platform.python_version()}
     for package in NUMERICAL_PACKAGES:
         try:

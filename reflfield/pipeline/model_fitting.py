@@ -28,7 +28,7 @@ from reflfield.pipeline.alignment import local_frames
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.pipeline.resampling import Resampled
-from reflfield.util.blocks import Blocks
+from reflfield.util.blocks import BlockFunction, Blocks
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -184,15 +184,8 @@ def _fitted_once(
 
     stored: dict[str, Any] = blocks.once(f"basis on the samples{part}", basis)
     model = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
-    parts = blocks.map(
-        f"coefficients on the samples{part}",
-        coefficients_block,
-        (reader, model),
-        reader.blocks_of(measured),
-    )
-    coefficients = model.coefficients.copy()
-    coefficients[measured] = parts.joined("coefficients")
-    return replace(model, coefficients=coefficients)
+    work = f"coefficients on the samples{part}"
+    return _with_coefficients(model, reader, measured, coefficients_block, blocks, work)
 
 
 def _within_bounds(
@@ -211,14 +204,22 @@ def _within_bounds(
         f"errors of the samples{name}", lambda: {"noise": _noise(context, model, reader)}
     )["noise"]
     model = normalised(model, float(noise), measured)
-    parts = blocks.map(
-        f"coefficients within bounds{name}",
-        bounded_block,
-        (reader, model),
-        reader.blocks_of(suspects),
-    )
+    work = f"coefficients within bounds{name}"
+    return _with_coefficients(model, reader, suspects, bounded_block, blocks, work)
+
+
+def _with_coefficients(
+    model: ClusteredModel,
+    reader: TexelReader,
+    texels: Indices,
+    solve: BlockFunction,
+    blocks: Blocks,
+    work: str,
+) -> ClusteredModel:
+    """Model whose coefficients of some texels are solved for, by blocks of the named work."""
+    parts = blocks.map(work, solve, (reader, model), reader.blocks_of(texels))
     coefficients = model.coefficients.copy()
-    coefficients[suspects] = parts.joined("coefficients")
+    coefficients[texels] = parts.joined("coefficients")
     return replace(model, coefficients=coefficients)
 
 

@@ -46,8 +46,12 @@ def write_report_page(context: Context, folder: Path) -> dict[str, Any]:
         context, field, results.arrays(context, "maps", AVERAGES)["average"], scores
     )
     write_report(folder / "index.html", content)
-    problems = scores.problems if scores is not None else ()
-    return {"sections": len(content.sections), comparison.PROBLEMS: list(problems)}
+    scores = scores or TruthScores()
+    return {
+        "sections": len(content.sections),
+        **scores.counts(),
+        comparison.PROBLEMS: list(scores.problems),
+    }
 
 
 def report_content(
@@ -308,13 +312,13 @@ def _compression_section(context: Context) -> Section:
     return sections.compression_section({**parts, "header, names": rest}, raw_bytes(context))
 
 
-def _stage(record: Any) -> sections.StageRecord:
+def _stage(record: Any) -> sections.StageSummary:
     counts = {k: v for k, v in record.counts.items() if isinstance(v, int)}
-    return sections.StageRecord(
+    return sections.StageSummary(
         name=record.name,
         seconds=record.seconds,
         peak_bytes=record.peak_bytes,
-        outputs=counts,
+        counts=counts,
         size_bytes=record.size_bytes,
         reused=record.reused,
     )

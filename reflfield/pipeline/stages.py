@@ -286,8 +286,8 @@ def run(
     *,
     hold_out: HoldOut | None = None,
     resources: Resources | None = None,
-    first: str | None = None,
-    last: str = STAGES[-1],
+    from_stage: str | None = None,
+    until: str = STAGES[-1],
 ) -> Context:
     """Make a reflectance field of a capture, and measure how good it is.
 
@@ -301,9 +301,9 @@ def run(
     hold_out : HoldOut, optional
         What is kept for comparison.
     resources : Resources, optional
-    first : str, optional
+    from_stage : str, optional
         This stage and all later ones are computed again even if nothing changed.
-    last : str
+    until : str
         Stop after this stage.
 
     Returns
@@ -318,7 +318,7 @@ def run(
     GeometryError
         If the silhouettes do not determine a surface.
     """
-    wanted, redo = stages_between(first, last)
+    wanted, redo = stages_between(from_stage, until)
     context = Context(
         capture,
         out,
@@ -343,7 +343,7 @@ def run(
     return context
 
 
-def stages_between(first: str | None, last: str) -> tuple[tuple[Stage, ...], set[str]]:
+def stages_between(from_stage: str | None, until: str) -> tuple[tuple[Stage, ...], set[str]]:
     """Return the stages up to the last one, and the names of those to compute again.
 
     Raises
@@ -351,12 +351,12 @@ def stages_between(first: str | None, last: str) -> tuple[tuple[Stage, ...], set
     InputError
         If a name is unknown, or the first stage comes after the last.
     """
-    wanted = ORDER[: _number("until", last) + 1]
-    redo = set(STAGES[_number("from_stage", first) :]) if first else set()
+    wanted = ORDER[: _number("until", until) + 1]
+    redo = set(STAGES[_number("from_stage", from_stage) :]) if from_stage else set()
     if redo and redo.isdisjoint(stage.name for stage in wanted):
         raise InputError(
-            f"from_stage, until: expected the first stage not after the last, received {first} "
-            f"after {last}"
+            f"from_stage, until: expected the first stage not after the last, received "
+            f"{from_stage} after {until}"
         )
     return wanted, redo
 

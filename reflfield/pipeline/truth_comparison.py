@@ -52,6 +52,18 @@ class TruthScores:
     completion: CompletionError | None = None
     problems: tuple[str, ...] = ()
 
+    def counts(self) -> dict[str, float]:
+        """Mean distances of the surfaces and median angles of the frames, with their units."""
+        counts = {
+            f"{name} to the truth, mm": surface.summary()["mean_mm"]
+            for name, surface in self.surfaces.items()
+        }
+        if self.frames is not None and len(self.frames.texel):
+            angles = self.frames.summary()
+            for name in ("normal", "tangent"):
+                counts[f"{name}s to the truth, degrees"] = angles[f"{name}_median_deg"]
+        return counts
+
 
 def truth_scores(context: Context, field: ReflectanceField) -> TruthScores | None:
     """All scores against the truth; without what of it is damaged. None without a truth."""

@@ -22,6 +22,12 @@ from reflfield.report.page import Picture
 SERIES_COLOURS = ("#1f5fbf", "#e07b1a", "#3c9d5b", "#8f3f97", "#6b7280")
 SIZE_INCHES = (5.6, 3.1)
 PIXELS_PER_INCH = 96
+# Around the axes, in inches: numbers of six digits, a power of ten above, labels. Fixed, as a
+# layout that measures them draws every plot twice.
+LEFT, RIGHT, BOTTOM, TOP = 0.76, 0.2, 0.52, 0.16
+# Of names left of bars: the mean width of a letter, and the most that they may take.
+INCHES_PER_LETTER = 0.078
+WIDEST_NAMES = 3.0
 # The ends of heavy tails are cut off, so that the bulk can be seen.
 HISTOGRAM_PERCENTILE = 99.5
 
@@ -150,7 +156,9 @@ def bars(names: Sequence[str], values: Sequence[float], x_label: str) -> Picture
         axes.grid(visible=False, axis="y")
 
     height = 0.9 + 0.27 * max(1, len(names))
-    return _drawn(draw, x_label, "", has_legend=False, size=(SIZE_INCHES[0], height))
+    letters = max(map(len, names), default=0)
+    left = min(0.15 + INCHES_PER_LETTER * letters, WIDEST_NAMES)
+    return _drawn(draw, x_label, "", has_legend=False, size=(SIZE_INCHES[0], height), left=left)
 
 
 def _drawn(
@@ -160,10 +168,15 @@ def _drawn(
     *,
     has_legend: bool,
     size: tuple[float, float] = SIZE_INCHES,
+    left: float = LEFT,
 ) -> Picture:
+    width, height = size
+    inside = (width - left - RIGHT, height - BOTTOM - TOP)
     with matplotlib.rc_context(_STYLE):
-        drawing = Drawing(figsize=size, layout="constrained")
-        axes = drawing.add_subplot()
+        drawing = Drawing(figsize=size)
+        axes = drawing.add_axes(
+            (left / width, BOTTOM / height, inside[0] / width, inside[1] / height)
+        )
         draw(axes)
         axes.set_xlabel(_plain(x_label))
         axes.set_ylabel(_plain(y_label))
@@ -171,8 +184,8 @@ def _drawn(
             axes.legend()
         stream = io.BytesIO()
         drawing.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
-    width, height = (round(inches * PIXELS_PER_INCH) for inches in size)
-    return Picture(stream.getvalue(), "image/svg+xml", width, height, is_plot=True)
+    width_px, height_px = (round(inches * PIXELS_PER_INCH) for inches in size)
+    return Picture(stream.getvalue(), "image/svg+xml", width_px, height_px, is_plot=True)
 
 
 def _scale(axes: Any, axis: str, is_logarithmic: bool) -> None:

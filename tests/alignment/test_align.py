@@ -7,6 +7,10 @@ from reflfield.alignment.frame_ambiguity import mean_rotation
 from reflfield.errors import InputError, ShapeError
 from reflfield.sphere.rotations import frames_from_normals
 
+# Mean error of refined normals, degrees: .030 was measured on clean samples, .033 with 2 % of
+# noise.
+FINE_DEG = 0.06
+
 
 def tilted_frames(rng, n, spread=0.35):
     """Frames scattered about the base frame on all sides."""
@@ -37,11 +41,11 @@ def test_normals_come_back_and_refinement_makes_them_sharp(relief, aligned, scen
     harmonic = align(samples, directions, directions, refine=False)
     coarse = scene.frame_errors(harmonic.local_from_base, frames)[0]
     fine, tangent = scene.frame_errors(aligned.local_from_base, frames)
-    # The band limit and the cut at the horizon leave degrees, the samples a tenth of one.
-    assert coarse.mean() < 3.0
-    assert fine.mean() < 0.3
-    # The mean tangent is a convention: the base frames', not the truth's.
-    assert tangent.mean() < 5.0
+    # .94 degrees was measured, what the band limit and the cut at the horizon leave.
+    assert coarse.mean() < 1.5
+    assert fine.mean() < FINE_DEG
+    # The mean tangent is a convention: the base frames', not the truth's. 2.7 was measured.
+    assert tangent.mean() < 4.0
     assert aligned.symmetries == ("half",)
 
 
@@ -102,7 +106,7 @@ def test_noise_of_two_per_cent(relief, scene, rng):
     frames, directions, samples = relief
     noisy = samples + 0.02 * samples.std() * rng.standard_normal(samples.shape)
     result = align(noisy, directions, directions)
-    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < 0.6
+    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < FINE_DEG
 
 
 def test_two_materials_are_told_apart(scene, rng):
@@ -114,7 +118,8 @@ def test_two_materials_are_told_apart(scene, rng):
     first = np.bincount(result.cluster[:40], minlength=2).argmax()
     agree = np.concatenate([result.cluster[:40] == first, result.cluster[40:] != first])
     assert agree.mean() >= 0.99
-    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < 4.0
+    # 1.0 to 1.3 degrees was measured with three seeds: one material alone leaves .94.
+    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < 2.0
 
 
 def test_blocks_from_a_source_give_the_same_as_an_array(relief, monkeypatch):
@@ -139,13 +144,13 @@ def test_texels_outside_the_training_are_as_good(relief, scene, monkeypatch):
     frames, directions, samples = relief
     monkeypatch.setattr("reflfield.alignment.model_fit.TRAINING_TEXELS", 60)
     result = align(samples, directions, directions)
-    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < 0.5
+    assert scene.frame_errors(result.local_from_base, frames)[0].mean() < FINE_DEG
 
 
-def mean_errors(found, truth, scene):
+def mean_errors(recovered, truth, scene):
     """Mean error of normals, degrees: of the recovered frames, and of the base frames."""
     base = np.tile(np.eye(3), (len(truth), 1, 1))
-    return (scene.frame_errors(frames, truth)[0].mean() for frames in (found, base))
+    return (scene.frame_errors(frames, truth)[0].mean() for frames in (recovered, base))
 
 
 @pytest.mark.parametrize(("one", "share"), [("view", 0.7), ("light", 0.95)])

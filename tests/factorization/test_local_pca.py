@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from sklearn.decomposition import PCA
 
 from reflfield.errors import InputError
 from reflfield.factorization import LocalPCA
@@ -36,11 +35,13 @@ def test_error_is_that_of_the_reconstruction(rng):
 
 @pytest.mark.reference
 def test_one_cluster_is_principal_component_analysis(rng):
+    from sklearn.decomposition import PCA  # long to import
+
     columns, _ = clustered_subspaces(rng, n_columns=500)
     fit = LocalPCA(n_clusters=1, n_components=5).fit(columns)
     other = PCA(5, svd_solver="full").fit(columns.T)
-    found = other.inverse_transform(other.transform(columns.T)).T
-    assert fit.residual == pytest.approx(np.sqrt(((columns - found) ** 2).mean()), rel=1e-3)
+    rebuilt = other.inverse_transform(other.transform(columns.T)).T
+    assert fit.residual == pytest.approx(np.sqrt(((columns - rebuilt) ** 2).mean()), rel=1e-3)
     np.testing.assert_allclose(fit.means[0], other.mean_, atol=1e-4)
 
 

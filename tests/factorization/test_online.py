@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.decomposition import IncrementalPCA
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.factorization import OnlineSVD
@@ -54,6 +53,8 @@ def test_full_rank_update_is_the_svd(rng, rounding, dtype, block):
 
 @pytest.mark.reference
 def test_truncated_update_matches_incremental_pca(rng):
+    from sklearn.decomposition import IncrementalPCA  # long to import
+
     spectrum = 0.7 ** np.arange(40)
     matrix = (rng.standard_normal((40, 40)) * spectrum) @ rng.standard_normal((40, 150))
     # Columns in pairs of opposite signs: the mean of every batch is zero.

@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pytest
@@ -99,9 +99,13 @@ class Run:
 
 
 @pytest.fixture(scope="session")
-def tiny_capture(tmp_path_factory):
+def tiny_capture(made_once):
     """Folder of the simulated capture. Read only."""
-    return write_capture(parse_scene(SCENE), tmp_path_factory.mktemp("captures") / "tiny")
+
+    def fill(folder):
+        write_capture(parse_scene(SCENE), folder)
+
+    return made_once("tiny", fill)[0]
 
 
 @pytest.fixture(scope="session")
@@ -135,15 +139,19 @@ def subprocess_run(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory, tiny_capture, tiny_options, subprocess_run):
-    """The whole run, once a session. Read only: copy it to change it."""
-    folder = tmp_path_factory.mktemp("runs") / "whole"
-    outcome = subprocess_run(
-        *("-m", "reflfield.cli", "run", tiny_capture, "-o", folder),
-        *("--config", tiny_options, *HELD_OUT),
-    )
-    assert outcome.status == 0, outcome.err
-    return Run(folder, outcome)
+def finished(made_once, tiny_capture, tiny_options, subprocess_run):
+    """The whole run, once for all workers. Read only: copy it to change it."""
+
+    def fill(folder):
+        outcome = subprocess_run(
+            *("-m", "reflfield.cli", "run", tiny_capture, "-o", folder),
+            *("--config", tiny_options, *HELD_OUT),
+        )
+        assert outcome.status == 0, outcome.err
+        return asdict(outcome)
+
+    folder, outcome = made_once("whole", fill)
+    return Run(folder, Outcome(**outcome))
 
 
 @pytest.fixture(scope="session")

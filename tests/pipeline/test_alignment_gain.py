@@ -75,7 +75,7 @@ def capture(tmp_path_factory):
 
 def gain_db(capture, out):
     """Mean PSNR on held-out photographs with alignment over that without, at one size."""
-    context = run(capture, out, OPTIONS, hold_out=HELD_OUT, last="comparison")
+    context = run(capture, out, OPTIONS, hold_out=HELD_OUT, until="comparison")
     sizes, psnr = [], []
     for stage, variant in (("compression", "field"), ("without_alignment",) * 2):
         sizes.append((context.stages.root / stage / "field.rfld").stat().st_size)

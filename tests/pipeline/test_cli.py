@@ -297,8 +297,9 @@ def test_demo(subprocess_run, tmp_path):
     assert (out / "capture" / "capture.json").is_file()
     metrics = json.loads((out / "metrics.json").read_text())
     assert len(metrics["frames"]) == 4
-    # Black scores below 15 dB here; how good it should be, benchmarks say.
-    assert metrics["mean"]["psnr_ldr"] > 20
+    # 30.7 was measured (tests/benchmarks/results/capture_demo.json), 28.9 with one lobe of
+    # three, 26.8 with the clustered model.
+    assert metrics["mean"]["psnr_ldr"] > 29.5
 
 
 def test_demo_passes_on_what_the_simulator_says(reflfield, monkeypatch, tmp_path):

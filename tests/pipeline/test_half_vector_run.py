@@ -43,11 +43,13 @@ def half_vector_run(capture, out, options=OPTIONS, workers=1):
 
 
 @pytest.fixture(scope="module")
-def made(tiny_capture, tmp_path_factory):
+def made(tiny_capture, made_once):
     """Folder of a whole run."""
-    out = tmp_path_factory.mktemp("half_vector")
-    half_vector_run(tiny_capture, out)
-    return out
+
+    def fill(folder):
+        half_vector_run(tiny_capture, folder)
+
+    return made_once("half_vector", fill)[0]
 
 
 @pytest.fixture(scope="module")

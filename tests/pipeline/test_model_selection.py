@@ -66,11 +66,13 @@ def run_auto(tiny_capture, tiny_options):
 
 
 @pytest.fixture(scope="module")
-def selected_run(run_auto, tmp_path_factory):
+def selected_run(run_auto, made_once):
     """Folder of a finished run with both options "auto". Read only: copy it to change it."""
-    out = tmp_path_factory.mktemp("selected_run") / "out"
-    run_auto(out, *AUTO)
-    return out
+
+    def fill(folder):
+        run_auto(folder, *AUTO)
+
+    return made_once("selected_run", fill)[0]
 
 
 @pytest.fixture
@@ -144,8 +146,8 @@ class TestWhatACandidateRunLeaves:
             assert f"{metrics['flip']:.4f}" in row
             assert f'alt="{name}"' in section
             assert f'alt="FLIP error {name}"' in section
-        taken = records(selected_run)["model_selection"]["counts"]["selected"]
-        assert f'<tr class="emphasised"><td>{taken}</td>' in section
+        selected = records(selected_run)["model_selection"]["counts"]["selected"]
+        assert f'<tr class="emphasised"><td>{selected}</td>' in section
         assert "unseen views and lights, which had no part in the selection" in section
 
     def test_stages_before_what_is_auto_are_shared(self, selected_run):
@@ -161,18 +163,18 @@ class TestWhatACandidateRunLeaves:
             assert len(inodes) == n_made, stage
 
     def test_time_counts_every_stage_once(self, selected_run):
-        found = {}
+        seconds = {}
         for root in (selected_run / "stages", *selected_run.glob("candidates/*/stages")):
             for path in root.glob("*/stage.json"):
                 record = json.loads(path.read_text())
                 if record["name"] != "model_selection":
-                    found[record["name"], record["key"]] = record["seconds"]
+                    seconds[record["name"], record["key"]] = record["seconds"]
         # The report's own time is known when it is done.
         timings = json.loads((selected_run / "timings.json").read_text())
-        assert timings["seconds"] == pytest.approx(sum(found.values()), rel=1e-9)
+        assert timings["seconds"] == pytest.approx(sum(seconds.values()), rel=1e-9)
         # Before what is "auto", for each visibility (and what its shadows show, if they are
         # traced), for each fit in it, the maps and the report.
-        assert len(found) == 6 + 2 * 3 + 1 + 4 * 2 + 2
+        assert len(seconds) == 6 + 2 * 3 + 1 + 4 * 2 + 2
 
     def test_options_are_as_asked_with_the_selection_above(self, selected_run):
         text = (selected_run / "options.toml").read_text()
@@ -199,12 +201,12 @@ class TestSecondRun:
             "-"
         )
         asked = (f"resampling.visibility={shadows}", f"compression.fit={fit}")
-        run_auto(selected_copy, *asked, last="comparison")
+        run_auto(selected_copy, *asked, until="comparison")
         assert computed_here(selected_copy) == []
 
     def test_accounts_add_up_with_shadows_the_other_way(self, selected_copy, run_auto):
-        taken = records(selected_copy)["model_selection"]["counts"]["selected"]
-        other = "kept" if taken.startswith("factored") else "factored"
+        selected = records(selected_copy)["model_selection"]["counts"]["selected"]
+        other = "kept" if selected.startswith("factored") else "factored"
         run_auto(selected_copy, f"resampling.visibility={other}", "compression.fit=grid")
         page = (selected_copy / "report" / "index.html").read_text()
         assert "not accounted for." not in page
@@ -212,7 +214,7 @@ class TestSecondRun:
     @pytest.mark.slow
     def test_from_model_selection_computes_the_candidates_again(self, selected_copy, run_auto):
         before = (selected_copy / "field.rfld").read_bytes()
-        run_auto(selected_copy, *AUTO, first="model_selection", last="comparison")
+        run_auto(selected_copy, *AUTO, from_stage="model_selection", until="comparison")
         after = STAGES[STAGES.index("model_selection") : STAGES.index("without_alignment")]
         if records(selected_copy)["model_selection"]["counts"]["selected"].startswith("kept"):
             after = [stage for stage in after if stage != "indirect"]
@@ -225,7 +227,7 @@ class TestSecondRun:
 
     def test_from_a_later_stage_keeps_the_selection(self, selected_copy, run_auto):
         before = stamps(selected_copy / "candidates")
-        run_auto(selected_copy, *AUTO, first="compression", last="compression")
+        run_auto(selected_copy, *AUTO, from_stage="compression", until="compression")
         assert computed_here(selected_copy) == ["compression"]
         assert stamps(selected_copy / "candidates") == before
 
@@ -258,16 +260,16 @@ def test_killed_in_a_candidate_run_it_goes_on_there(
 def test_no_candidate_run_before_it_matters(selected_copy, run_auto):
     shutil.rmtree(selected_copy / "candidates")
     shutil.rmtree(selected_copy / "stages" / "model_selection")
-    run_auto(selected_copy, *AUTO, last="observations")
+    run_auto(selected_copy, *AUTO, until="observations")
     compression = ("compression.fit=auto", "compression.model=clustered")
-    run_auto(selected_copy, "resampling.visibility=kept", *compression, last="resampling")
+    run_auto(selected_copy, "resampling.visibility=kept", *compression, until="resampling")
     assert not (selected_copy / "candidates").exists()
     assert "selected" not in (selected_copy / "options.toml").read_text()
 
 
 def test_without_photographs_the_number_of_samples_decides_and_says_so(run_auto, tmp_path):
     kept = ("resampling.visibility=kept", AUTO[1])
-    context = run_auto(tmp_path, *kept, hold_out=HoldOut(), last="compression")
+    context = run_auto(tmp_path, *kept, hold_out=HoldOut(), until="compression")
     assert context.options.compression.fit == "samples"
     assert open_field(tmp_path / "field.rfld").metadata["options"]["compression"]["fit"] == (
         "samples"
@@ -281,7 +283,7 @@ def test_without_photographs_the_number_of_samples_decides_and_says_so(run_auto,
 def test_photographs_held_out_one_by_one_decide_too(run_auto, tmp_path, tiny_capture):
     kept = ("resampling.visibility=kept", AUTO[1])
     held = HoldOut(photographs=3)
-    context = run_auto(tmp_path, *kept, hold_out=held, last="compression")
+    context = run_auto(tmp_path, *kept, hold_out=held, until="compression")
     psnr = {}
     for name in ("samples", "grid"):
         compared = tmp_path / "stages" / "model_selection" / name / "heldout.json"
@@ -381,7 +383,7 @@ class TestCandidates:
 
 
 @pytest.mark.parametrize(
-    ("psnr", "taken"),
+    ("psnr", "best"),
     [
         # Of equal ones the first, whatever comes later.
         ({"a": [20.0, 22.0], "b": [20.0, 22.0]}, "a"),
@@ -398,8 +400,8 @@ class TestCandidates:
         ({"a": [20.0], "b": [20.5], "c": [21.2]}, "c"),
     ],
 )
-def test_a_lead_beyond_chance_is_needed(psnr, taken):
-    assert model_selection.clearly_best(psnr) == taken
+def test_a_lead_beyond_chance_is_needed(psnr, best):
+    assert model_selection.clearly_best(psnr) == best
 
 
 RIG = {
@@ -456,7 +458,7 @@ def test_shadows_are_treated_as_the_object_needs(better, run_auto, tmp_path):
         *grids,
         capture=capture,
         hold_out=HoldOut(views=1, lights=n_lights),
-        last="compression",
+        until="compression",
     )
     print(context.stages.record("model_selection").counts["heldout PSNR, dB"])
     assert context.options.resampling.visibility == better

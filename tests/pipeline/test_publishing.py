@@ -87,7 +87,7 @@ def test_unchanged_results_are_left_alone(run, out):
 
 
 @pytest.mark.parametrize(
-    ("options", "last", "new", "outdated"),
+    ("options", "until", "new", "outdated"),
     [
         (OTHER_ALIGNMENT, "compression", {"field.rfld"}, LATER),
         (OTHER_ALIGNMENT, "alignment", set(), LATER | {"field.rfld"}),
@@ -99,10 +99,10 @@ def test_unchanged_results_are_left_alone(run, out):
         (OTHER_ALIGNMENT, "hull", set(), set()),
     ],
 )
-def test_what_does_not_follow_is_set_apart(run, out, caplog, options, last, new, outdated):
+def test_what_does_not_follow_is_set_apart(run, out, caplog, options, until, new, outdated):
     run()
     before = results(out)
-    run(options, last=last)
+    run(options, until=until)
     after = results(out)
     assert set(after) == (FIELD | LATER | RECORDS) - outdated | {
         f"outdated/{name}" for name in outdated
@@ -112,7 +112,7 @@ def test_what_does_not_follow_is_set_apart(run, out, caplog, options, last, new,
     kept = (FIELD | LATER) - outdated
     assert {name for name in kept if after[name] != before[name]} == new
     assert ("outdated: made from other stages than now" in caplog.text) == bool(outdated)
-    assert f"Of a run up to the stage '{last}'" in after["options.toml"]
+    assert f"Of a run up to the stage '{until}'" in after["options.toml"]
     # A whole run leaves nothing outdated.
     caplog.clear()
     run(options)

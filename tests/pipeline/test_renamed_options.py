@@ -1,10 +1,11 @@
-"""Options and stages that were renamed are accepted by their old names, with one line."""
+"""Options and stages of earlier versions are accepted, with one line."""
 
 import logging
+from dataclasses import replace
 
 import pytest
 
-from reflfield.options import RENAMED_OPTIONS, with_tables
+from reflfield.options import REMOVED_OPTIONS, RENAMED_OPTIONS, with_tables
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import RENAMED, STAGES
 
@@ -26,6 +27,17 @@ def test_an_old_name_sets_the_new_option(old, caplog):
         options = with_tables(PipelineOptions(), tables)
     assert value_of(options, new) == changed
     assert [record.getMessage().count(new) for record in caplog.records] == [1]
+
+
+@pytest.mark.parametrize("gone", REMOVED_OPTIONS)
+def test_an_option_that_is_gone_is_ignored_with_one_line(gone, caplog):
+    """As the options that a run of an earlier version has written down list it."""
+    stage, name = gone.split(".")
+    with caplog.at_level(logging.WARNING, logger="reflfield"):
+        options = with_tables(PipelineOptions(), {stage: {name: 1.0}, "seed": 3})
+    assert options == replace(PipelineOptions(), seed=3)
+    (record,) = caplog.records
+    assert f"{gone!r} is gone: {REMOVED_OPTIONS[gone]}" in record.getMessage()
 
 
 @pytest.mark.parametrize("old", RENAMED)

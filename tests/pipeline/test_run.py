@@ -37,6 +37,11 @@ FILES = (
 )
 
 
+# Of the held-out photograph of the tiny ball, at every size. 17.5 to 19.1 was measured; its
+# mean colour all over scores 12.5, black 9.9.
+LEAST_HELDOUT_DB = 15.0
+
+
 def texels_of(folder):
     with np.load(folder / "stages" / "atlas" / "atlas.npz") as stored:
         arrays = dict(stored)
@@ -129,6 +134,14 @@ class TestWhatARunLeaves:
         assert all(stage["peak_bytes"] > 1 << 20 for stage in timings["stages"])
         assert {"reflfield", "numpy", "python"} <= set(timings["versions"])
 
+    def test_counts_of_the_report_say_how_far_the_truth_is(self, finished):
+        stages = json.loads((finished.folder / "timings.json").read_text())["stages"]
+        (counts,) = (s["counts"] for s in stages if s["name"] == "report")
+        # .38 mm and 4.3 degrees were measured; a pixel covers 4 mm, and a random frame's
+        # normal is 90 degrees off.
+        assert 0 < counts["hull to the truth, mm"] < 0.8
+        assert 0 < counts["normals to the truth, degrees"] < 8.0
+
     def test_options_are_those_used(self, finished, tiny_options):
         used = tomllib.loads((finished.folder / "options.toml").read_text())
         asked = tomllib.loads(tiny_options.read_text())
@@ -150,12 +163,12 @@ class TestWhatARunLeaves:
         }
         ours, other = (counts[name] for name in ("compression", "without_alignment"))
         assert "With alignment and without" in page
-        for found in (ours, other):
-            assert f"{100 * found['relative error of the samples']:.2f}" in page
-            assert found["clusters"] == ours["clusters"]
-            assert found["components"] == ours["components"]
-            assert abs(found["field bytes"] - ours["field bytes"]) < 0.02 * ours["field bytes"]
-            assert found["samples measured"] == ours["samples measured"] > 1000
+        for field in (ours, other):
+            assert f"{100 * field['relative error of the samples']:.2f}" in page
+            assert field["clusters"] == ours["clusters"]
+            assert field["components"] == ours["components"]
+            assert abs(field["field bytes"] - ours["field bytes"]) < 0.02 * ours["field bytes"]
+            assert field["samples measured"] == ours["samples measured"] > 1000
         assert {"heldout PSNR, dB", "heldout PSNR without alignment, dB"} <= set(
             counts["comparison"]
         )
@@ -178,7 +191,7 @@ class TestWhatARunLeaves:
             assert sizes == sorted(sizes, reverse=True)
             # The coarsest is worse than the finest; in between, noise may help by chance.
             assert quality[-1] < quality[0] - 0.5
-        assert all(p["heldout_db"] > 5 for p in points)
+        assert all(p["heldout_db"] > LEAST_HELDOUT_DB for p in points)
         assert "Quality against size" in (finished.folder / "report" / "index.html").read_text()
 
     def test_results_on_stdout_and_only_progress_on_stderr(self, finished):
@@ -273,9 +286,9 @@ class TestSecondRun:
             run_tiny(run_copy, "--psnr", f"{wanted:.2f}", "--until", "compression").status == 0
         )
         records = json.loads((run_copy / "timings.json").read_text())["stages"]
-        (found,) = (r["counts"] for r in records if r["name"] == "compression")
-        assert found["LDR PSNR of the samples, dB"] >= wanted - 0.05
-        assert found["field bytes"] < made["field bytes"]
+        (smaller,) = (r["counts"] for r in records if r["name"] == "compression")
+        assert smaller["LDR PSNR of the samples, dB"] >= wanted - 0.05
+        assert smaller["field bytes"] < made["field bytes"]
 
     def test_a_quality_that_is_not_reached_is_said_and_has_a_status_of_its_own(
         self, run_copy, run_tiny
@@ -301,9 +314,10 @@ class TestSecondRun:
         assert "size: expected at least" in outcome.err
 
     def test_without_the_comparison_the_field_is_the_same(self, run_copy, run_tiny, finished):
-        off = ("--set", "comparison.without_alignment=false")
+        names = ("without_alignment", "rate_distortion")
+        off = [word for name in names for word in ("--set", f"comparison.{name}=false")]
         assert run_tiny(run_copy, *off, "--from", "compression").status == 0
-        assert "without_alignment" not in states(run_copy)
+        assert not set(names) & set(states(run_copy))
         assert digest(run_copy / "field.rfld") == digest(finished.folder / "field.rfld")
         page = (run_copy / "report" / "index.html").read_text()
         assert "With alignment and without" not in page

@@ -78,7 +78,7 @@ def error_of(clipped, exposed, tiny_options, folder):
     """Root mean square of the field's error on an unseen photograph that is not clipped."""
     options = with_tables(PipelineOptions(), tomllib.loads(tiny_options.read_text()))
     context = run(
-        clipped, folder, options, hold_out=HoldOut(views=1, lights=1), last="compression"
+        clipped, folder, options, hold_out=HoldOut(views=1, lights=1), until="compression"
     )
     frames, unclipped = context.held_out, open_capture(exposed)
     field, squares = open_field(folder / "field.rfld"), []
@@ -96,10 +96,10 @@ def test_field_of_clipped_photographs_is_nearer_to_those_that_are_not(
     clipped, exposed, tiny_options, tmp_path, monkeypatch
 ):
     arguments = clipped, exposed, tiny_options
-    found = error_of(*arguments, tmp_path / "left-out")
+    left_out = error_of(*arguments, tmp_path / "left-out")
     monkeypatch.setattr(image_projection, "NOT_MEASURED", ("dark",))
     is_dark = np.array([kind == "dark" for kind in image_projection.VALUE_KINDS])
     monkeypatch.setattr(image_projection, "IS_GAP", is_dark)
     counted = error_of(*arguments, tmp_path / "counted")
-    print(found, counted)
-    assert found < 0.9 * counted
+    print(left_out, counted)
+    assert left_out < 0.9 * counted

@@ -47,7 +47,7 @@ def pictures(tiny_capture, tiny_options, tmp_path_factory):
         path.write_text(json.dumps(document))
         capture = open_capture(folder / "capture")
         out = folder / "out"
-        run(capture, out, options, hold_out=HoldOut(views=1, lights=1), last="compression")
+        run(capture, out, options, hold_out=HoldOut(views=1, lights=1), until="compression")
         frames = capture.subset([0, 5], [1, 3])
         for _ in relight_photographs(open_field(out / "field.rfld"), frames, folder / "relit"):
             pass

@@ -71,10 +71,11 @@ def full_content(rng, title="vase", prefix="heldout_"):
         for i, p in enumerate(pairs)
     ]  # fmt: skip
     stages = [
-        sections.StageRecord("hull", 12.4, 8 * 10**8, {"silhouettes": 36}, {"vertices": 10002},
-                             10**6),
-        sections.StageRecord("observations", 75.0, 2 * 10**9, {"photographs": 1024},
-                             {"samples": 33_000_000}, 2 * 10**8, reused=True),
+        sections.StageSummary("hull", 12.4, 8 * 10**8, {"silhouettes": 36, "vertices": 10002},
+                              10**6),
+        sections.StageSummary("observations", 75.0, 2 * 10**9,
+                              {"photographs": 1024, "samples": 33_000_000}, 2 * 10**8,
+                              reused=True),
     ]  # fmt: skip
     return ReportContent(
         title=title,

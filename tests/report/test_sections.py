@@ -148,12 +148,12 @@ def test_turned_frames_show_their_tilt(samples):
 def test_stage_times_add_up_and_reuse_is_said():
     section = sections.stages_section(
         [
-            sections.StageRecord("hull", 61.0, inputs={"views": 32}, outputs={"faces": 20_000}),
-            sections.StageRecord("atlas", 4.0, peak_bytes=10**9, reused=True),
+            sections.StageSummary("hull", 61.0, counts={"views": 32, "faces": 20_000}),
+            sections.StageSummary("atlas", 4.0, peak_bytes=10**9, reused=True),
         ]
     )
     rows = tables(section)[0].rows
-    assert rows[0] == ("hull", "1 min 01 s", None, "32 views", "20\u202f000 faces", None)
+    assert rows[0] == ("hull", "1 min 01 s", None, "32 views, 20\u202f000 faces", None)
     assert rows[1][:3] == ("atlas (reused)", "4.0 s", "1 GB")
     assert rows[2][1] == "1 min 05 s"
 
@@ -208,6 +208,37 @@ def test_histogram_counts_everything_in_percent():
     picture = plots.histogram({"a": [0.1, 0.2, 0.3, 9.0, np.nan]}, "x", "y", limits=(0, 1))
     assert picture.is_plot
     assert (picture.width, picture.height) == (538, 298)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plots.bars(["held_out_silhouettes", "hull"], [12345.6, 1.0], "seconds"),
+        lambda: plots.bars(["hull"], [0.5], "seconds"),
+        lambda: plots.lines({"a": ([1, 2], [0, 987654])}, "iteration", "score"),
+        lambda: plots.lines(
+            {"a": ([0.05, 20], [1e-4, 1])}, "MB", "error", log_x=True, log_y=True
+        ),
+        lambda: plots.histogram({"a": np.linspace(-1e-4, 1e-4, 99)}, "mm", "points, %"),
+    ],
+    ids=["bars", "bar", "lines", "logarithmic", "histogram"],
+)
+def test_texts_of_plots_fit_their_margins(draw, monkeypatch):
+    drawings = []
+
+    class Kept(plots.Drawing):
+        def __init__(self, **named):
+            super().__init__(**named)
+            drawings.append(self)
+
+    monkeypatch.setattr(plots, "Drawing", Kept)
+    draw()
+    (drawing,) = drawings
+    box, (width, height) = drawing.get_tightbbox(), drawing.get_size_inches()
+    assert box.x0 >= 0
+    assert box.y0 >= 0
+    assert box.x1 <= width
+    assert box.y1 <= height
 
 
 def test_accounts_that_do_not_add_up_are_said():

@@ -24,7 +24,7 @@ from reflfield.report.sections.held_out_images import (
     metrics_table,
 )
 from reflfield.report.sections.run_summary import (
-    StageRecord,
+    StageSummary,
     compression_section,
     key_numbers,
     run_section,
@@ -43,7 +43,7 @@ __all__ = [
     "FieldVariant",
     "RatePoint",
     "SilhouetteView",
-    "StageRecord",
+    "StageSummary",
     "ablation_section",
     "alignment_section",
     "atlas_section",

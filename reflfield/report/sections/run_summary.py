@@ -109,8 +109,8 @@ def compression_section(parts: Mapping[str, int], raw_bytes: int) -> Section:
 
 
 @dataclass(frozen=True)
-class StageRecord:
-    """Resources, inputs and outputs of one stage.
+class StageSummary:
+    """Resources and counts of one stage.
 
     Attributes
     ----------
@@ -119,9 +119,9 @@ class StageRecord:
         Wall time.
     peak_bytes : int, optional
         Peak resident memory.
-    inputs, outputs : mapping of name to count
-        Such as ``{"photographs": 1024}``; every item left out is
-        counted.
+    counts : mapping of name to count
+        What went in and what came out, such as ``{"photographs": 1024}``; every item left
+        out is counted.
     size_bytes : int, optional
         Of its results on disk.
     reused : bool
@@ -132,18 +132,17 @@ class StageRecord:
     name: str
     seconds: float
     peak_bytes: int | None = None
-    inputs: Mapping[str, int] = field(default_factory=dict)
-    outputs: Mapping[str, int] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
     size_bytes: int | None = None
     reused: bool = False
 
 
-def stages_section(stages: Sequence[StageRecord]) -> Section:
-    """Stages: time, peak memory, counts in and out, sizes on disk.
+def stages_section(stages: Sequence[StageSummary]) -> Section:
+    """Stages: time, peak memory, counts, sizes on disk.
 
     Parameters
     ----------
-    stages : sequence of StageRecord
+    stages : sequence of StageSummary
         In the order they run.
 
     Returns
@@ -156,17 +155,16 @@ def stages_section(stages: Sequence[StageRecord]) -> Section:
             stage.name + (" (reused)" if stage.reused else ""),
             format_seconds(stage.seconds),
             None if stage.peak_bytes is None else format_bytes(stage.peak_bytes),
-            _counts(stage.inputs),
-            _counts(stage.outputs),
+            _counts(stage.counts),
             None if stage.size_bytes is None else format_bytes(stage.size_bytes),
         )
         for stage in stages
     )
     table = Table(
-        ("stage", "wall time", "peak memory", "in", "out", "on disk"),
-        (*rows, ("total", format_seconds(total), None, None, None, None)),
-        "Counts in and out of each stage. Reused stages show the wall time of the run that "
-        "computed them.",
+        ("stage", "wall time", "peak memory", "counts", "on disk"),
+        (*rows, ("total", format_seconds(total), None, None, None)),
+        "Counts of what went into each stage and came out. Reused stages show the wall time of "
+        "the run that computed them.",
         emphasised=(len(rows),),
     )
     plot = plots.bars([s.name for s in stages], [s.seconds for s in stages], "seconds")
