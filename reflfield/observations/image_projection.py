@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.clipping import BLACK
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.observations.store import (
@@ -27,8 +28,9 @@ from reflfield.util.validation import check_shape
 
 Floats = NDArray[np.float32]
 Kinds = NDArray[np.uint8]
-# What a value of a photograph at a texel may be: measured; at the upper limit of sensor or
-# file; at code 0; under alpha 0; of a colour that the light has not; where it gives nothing.
+# What a value of a photograph at a texel may be. As `capture.clipping` has it: measured; at the
+# upper limit of sensor or file; at code 0; under alpha 0. And of a colour that the light has
+# not; where it gives nothing.
 VALUE_KINDS = ("measured", "saturated", "black", "transparent", "dark", "unlit")
 # Those that say nothing of the sample.
 NOT_MEASURED = ("saturated", "transparent", "dark")
@@ -375,9 +377,8 @@ def _samples_at(
     images = np.zeros((len(lights), camera.height, camera.width, 3), np.float32)
     kinds = np.zeros((len(points), len(lights), 3), np.uint8)
     for j, index in enumerate(indices):
-        image, measured = capture.read_measured(int(index))
-        if not measured.all():
-            of_pixels = pixel_kinds(image, measured)
+        image, of_pixels = capture.read_kinds(int(index))
+        if of_pixels.any():
             image = with_bounded_black(image, of_pixels)
             _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
         images[j] = image
@@ -396,31 +397,17 @@ def _samples_at(
     return values, kinds
 
 
-def pixel_kinds(image: Floats, measured: NDArray[np.bool_]) -> Kinds:
-    """Of what kind each value (h, w, 3) of a photograph is: a place in `VALUE_KINDS`.
-
-    A value that is no measurement is black where it is zero, saturated where it is at least
-    half of the largest of its channel, and else lies under alpha 0.
-    """
-    bright = image >= 0.5 * image.max(axis=(0, 1))
-    kinds = np.full(image.shape, VALUE_KINDS.index("transparent"), np.uint8)
-    kinds[bright] = VALUE_KINDS.index("saturated")
-    kinds[image <= 0] = VALUE_KINDS.index("black")
-    kinds[measured] = 0
-    return kinds
-
-
 def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
     """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
 
     Examples
     --------
     >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
-    >>> kinds = pixel_kinds(image, image > 0)
+    >>> kinds = np.where(image > 0, 0, BLACK)
     >>> with_bounded_black(image, kinds)[0, 0].round(3)
     array([0.105, 0.021, 0.211], dtype=float32)
     """
-    black = kinds == VALUE_KINDS.index("black")
+    black = kinds == BLACK
     if not black.any():
         return image
     positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)

@@ -20,7 +20,7 @@ MEASURED = "measured.npz"
 TRACE = 1e-3
 # What is told of, and the remedy. Not of black: an object has sides that no light reaches.
 TOLD = {
-    "saturated": "saturated and left out; expose shorter, or bracket",
+    "saturated": "saturated, known only to be at least as bright; expose shorter, or bracket",
     "transparent": "under alpha 0 and left out; check silhouettes and cameras",
 }
 

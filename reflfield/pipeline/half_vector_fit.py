@@ -74,7 +74,7 @@ SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 8, 1 / 4
 # Pixels under a light that are fitted to at most: more would take hours.
 MOST_PIXELS = 32_000_000
 # Memory of a pixel under a light, and of a pixel with the texels under it.
-VALUE_BYTES, FOOTPRINT_BYTES = 12, 100
+VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
 # Quantisation step of cube roots of samples over that of white, at a relative step of a half.
