@@ -319,9 +319,11 @@ def has_views(projection: Projection, views: range) -> bool:
 
 
 def look_into(projection: Projection) -> LookedInto:
-    """Samples of a few photographs, spread evenly over the capture, at texels spread so."""
+    """Samples of a few photographs, spread over lights and views, at texels spread evenly."""
     capture, n = projection.capture, len(projection.capture.photographs)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
+    order = sorted(range(n), key=lambda i: (capture.photographs[i].light, i))
+    places = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
+    chosen = np.sort(np.array(order)[places])
     columns = []
     for index in chosen:
         photograph = capture.photographs[index]

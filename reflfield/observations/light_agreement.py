@@ -99,7 +99,7 @@ def other_light_axes(looks: list[Look]) -> str:
     str
         Empty where the lights fit as described, or nothing fits better.
     """
-    described = agreement(looks, _as_described)
+    described = agreement(looks, as_described)
     if described is None or described > 1 - LEAST_LEAD:
         return ""
     so_far = (
@@ -138,15 +138,15 @@ def _hollow(looks: list[Look], others: float) -> str | None:
     if inside is None or inside < max(LEAST_IF_MEANT, others - HOLLOW_TIE):
         return None
     beside = [_part(look, np.abs(look.normals @ opening) < BESIDE) for look in looks]
-    as_described, otherwise = agreement(beside, _as_described), agreement(beside, turned)
-    if as_described is None or otherwise is None:
+    told, otherwise = agreement(beside, as_described), agreement(beside, turned)
+    if told is None or otherwise is None:
         axis = ", ".join(f"{x:z.1f}" for x in opening)
         return (
             f", but of {inside:.2f} with the lights turned by half about ({axis}); either the "
             "object is hollow there, which its outlines do not show, or the axes of lights and "
             "cameras differ"
         )
-    return "" if as_described > otherwise else None
+    return "" if told > otherwise else None
 
 
 def _part(look: Look, chosen: NDArray[np.bool_]) -> Look:
@@ -178,16 +178,9 @@ def agreement(looks: list[Look], reading: Reading) -> float | None:
 
 
 def _correlation(look: Look, reading: Reading) -> float | None:
-    light = look.light
-    if light.kind not in (POINT, SPOT, DIRECTIONAL):
-        return None
-    at = light.kind != DIRECTIONAL
-    place = reading(light.position if at else light.direction, look.camera, at)
-    towards = place - look.points if at else np.broadcast_to(place, look.points.shape)
-    length = np.linalg.norm(towards, axis=1)
-    cosine = np.maximum((towards * look.normals).sum(axis=1) / np.maximum(length, 1e-300), 0.0)
+    cosine = cosines(look, reading)
     known = np.isfinite(look.brightness)
-    if known.sum() < FEWEST_POINTS:
+    if cosine is None or known.sum() < FEWEST_POINTS:
         return None
     x, y = cosine[known], np.sqrt(np.maximum(look.brightness[known], 0.0))
     if y.std() == 0:
@@ -197,7 +190,20 @@ def _correlation(look: Look, reading: Reading) -> float | None:
     return float(np.corrcoef(x, y)[0, 1])
 
 
-def _as_described(vector: Array, camera: Camera, is_position: bool) -> Array:
+def cosines(look: Look, reading: Reading) -> Array | None:
+    """Cosine (n,) to the light at each point, 0 on its other side; None if it is unknown."""
+    light = look.light
+    if light.kind not in (POINT, SPOT, DIRECTIONAL):
+        return None
+    at = light.kind != DIRECTIONAL
+    place = reading(light.position if at else light.direction, look.camera, at)
+    towards = place - look.points if at else np.broadcast_to(place, look.points.shape)
+    length = np.linalg.norm(towards, axis=1)
+    return np.maximum((towards * look.normals).sum(axis=1) / np.maximum(length, 1e-300), 0.0)
+
+
+def as_described(vector: Array, camera: Camera, is_position: bool) -> Array:
+    """Reading of what is in the world's axes."""
     return vector
 
 
