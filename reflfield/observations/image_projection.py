@@ -204,8 +204,8 @@ class Projected:
         what they are: see `VALUE_KINDS`.
     measured : (n_texels, n_lights) bool
         True where some camera measured a value under the light.
-    brightest : float
-        Largest sample, 1/sr; 0 where everything is dark.
+    brightest, darkest : float
+        Largest and smallest sample, 1/sr; 0 where everything is dark, where nothing is negative.
     looked_into : LookedInto
         Some of the samples.
     """
@@ -214,6 +214,7 @@ class Projected:
     values: NDArray[np.int64]
     measured: NDArray[np.bool_]
     brightest: float
+    darkest: float
     looked_into: LookedInto
 
     def count(self, kind: str) -> int:
@@ -261,15 +262,18 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         intact=has_views,
         at_once=at_once,
     )
-    n_photographs, values, brightest = 0, [], 0.0
+    n_photographs, values, brightest, darkest = 0, [], 0.0, 0.0
     measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
     for part in parts:
         n_photographs += int(part["photographs"])
         values.append(part["values"])
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
+        darkest = min(darkest, float(part["darkest"]))
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
-    projected = Projected(n_photographs, np.concatenate(values), bits, brightest, first)
+    projected = Projected(
+        n_photographs, np.concatenate(values), bits, brightest, darkest, first
+    )
     n_gaps = sum(projected.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(projected.values.sum()), 1))
     return projected
@@ -284,7 +288,7 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
     measured = np.zeros((len(points), n_lights), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
-    n_read, brightest = 0, 0.0
+    n_read, brightest, darkest = 0, 0.0, 0.0
     for i, view in enumerate(views):
         seen = np.flatnonzero(projection.visible[:, view])
         for lights, values, kinds in _view_samples(
@@ -296,12 +300,14 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
             measured[seen[:, None], lights] |= IS_KNOWN[kinds].any(axis=2)
             n_read += len(lights)
             brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
+            darkest = min(darkest, float(np.fmin.reduce(values, axis=None, initial=0.0)))
     store[:, views.start : views.stop] = block
     return {
         "photographs": np.array(n_read),
         "values": counts,
         "measured": np.packbits(measured, axis=1),
         "brightest": np.array(brightest),
+        "darkest": np.array(darkest),
     }
 
 
