@@ -205,7 +205,7 @@ class Projected:
     measured : (n_texels, n_lights) bool
         True where some camera measured a value under the light.
     brightest, darkest : float
-        Largest and smallest sample, 1/sr; 0 where everything is dark, where nothing is negative.
+        Largest and smallest sample, 1/sr; 0 where all is dark, where nothing is negative.
     looked_into : LookedInto
         Some of the samples.
     """
