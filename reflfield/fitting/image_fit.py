@@ -63,11 +63,15 @@ class ImageFit:
         Diagonal of the tilts: how well each normal is determined.
     residual : float
         Root mean square of the weighted residuals before the step.
+    n_bounds, n_unmet : int
+        Saturated values, and those that the model was darker than before the step.
     """
 
     model: HalfVectorModel
     information: Array
     residual: float
+    n_bounds: int = 0
+    n_unmet: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +212,11 @@ def image_step(
         model=_changed(model, change),
         information=diagonal[:, 3 + model.n_lobes : 5 + model.n_lobes].mean(axis=1),
         residual=float(np.sqrt(sum(s.squares for s in starts) / n_values)),
+        n_bounds=sum(view.n_bounds for view in views),
+        n_unmet=sum(
+            int(np.count_nonzero(s.system.weight[view.at_least]))
+            for view, s in zip(views, starts, strict=True)
+        ),
     )
 
 

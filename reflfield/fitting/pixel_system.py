@@ -173,6 +173,11 @@ class ViewPixels:
         """Values that count, all channels of one as one."""
         return int(np.count_nonzero(~np.isnan(self.values).all(axis=2)))
 
+    @property
+    def n_bounds(self) -> int:
+        """Values that are bounds from below."""
+        return int(np.count_nonzero(~np.isnan(self.values[self.at_least])))
+
 
 def view_pixels(
     capture: Capture,

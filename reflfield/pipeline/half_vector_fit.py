@@ -356,12 +356,14 @@ def fitted_on_surface(fit: HalfVectorFit, folder: Path) -> ImageFit:
 def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) -> ImageFit:
     def fitted() -> dict[str, NDArray[Any]]:
         image_fit = fit.to_photographs(model, folder)
-        extra = {"information": image_fit.information, "residual": np.array(image_fit.residual)}
+        numbers = ("information", "residual", "n_bounds", "n_unmet")
+        extra = {name: np.asarray(getattr(image_fit, name)) for name in numbers}
         return arrays_of(image_fit.model) | extra
 
     stored: dict[str, Any] = fit.context.blocks(folder).once("fit to the photographs", fitted)
     information, residual = stored.pop("information"), float(stored.pop("residual"))
-    return ImageFit(HalfVectorModel(**stored), information, residual)
+    counts = int(stored.pop("n_bounds")), int(stored.pop("n_unmet"))
+    return ImageFit(HalfVectorModel(**stored), information, residual, *counts)
 
 
 def stored_half_vector(context: Context) -> HalfVectorModel:
@@ -375,7 +377,8 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     """Fit a half-vector model, write its field, and measure it on the samples."""
     context = context.refined
     fit = HalfVectorFit(context)
-    model = (fitted_on_surface if context.on_surface else fitted_on_hull)(fit, folder).model
+    fitted = (fitted_on_surface if context.on_surface else fitted_on_hull)(fit, folder)
+    model = fitted.model
     made = fit.made(model)
     write_field(folder / "field.rfld", made)
     write_model(folder / MODEL, model, fit.white)
@@ -391,6 +394,8 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
+        "saturated values, fitted as bounds from below": fitted.n_bounds,
+        "of them fitted darker": fitted.n_unmet,
         **made.counts,
         "field bytes": size,
         "raw bytes": raw,

@@ -179,7 +179,11 @@ def test_texels_that_are_saturated_wherever_they_are_seen_are_not_darker_than_th
         with ThreadPoolExecutor(2) as pool:
             for _ in range(3):
                 normals = truth.frames[:, 2]
-                found = image_step(fitted, found, graph_of(N_TEXELS), normals, pool).model
+                step = image_step(fitted, found, graph_of(N_TEXELS), normals, pool)
+                found = step.model
+        n_clipped = sum(clipped.sum() for clipped in limits)
+        assert step.n_bounds == (n_clipped if as_bounds else 0)
+        assert step.n_unmet < 0.5 * n_clipped
         shades = [shown(found, v)[clipped] for v, clipped in zip(views, limits, strict=True)]
         return np.maximum(1 - np.concatenate(shades) / level, 0).mean()
 
