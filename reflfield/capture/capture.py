@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
+from reflfield.capture.clipping import kinds_of_bracket
 from reflfield.capture.exposures import merge_exposures
 from reflfield.capture.image_files import (
     AS_STATED,
@@ -21,7 +22,7 @@ from reflfield.capture.image_files import (
     read_coverage,
     read_exposure,
     read_image,
-    read_measured,
+    read_kinds,
     stores_alpha,
 )
 from reflfield.capture.lights import UNKNOWN, Light
@@ -89,20 +90,19 @@ class Photograph:
         if len(self.exposures) == 1:
             first = self.exposures[0]
             return read_image(first.path, first.reading) / np.float32(first.seconds)
-        return self.read_measured()[0]
+        return self.read_kinds()[0]
 
-    def read_measured(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Radiance and which of its values are measurements (`Capture.read_measured`)."""
+    def read_kinds(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Radiance and which of its values are measurements (`Capture.read_kinds`)."""
         if len(self.exposures) == 1:
             first = self.exposures[0]
-            image, measured = read_measured(first.path, first.reading)
-            return image / np.float32(first.seconds), measured
+            image, kinds = read_kinds(first.path, first.reading)
+            return image / np.float32(first.seconds), kinds
         read = [read_exposure(e.path, e.reading) for e in self.exposures]
+        images, kinds_of_each, encodings = zip(*read, strict=True)
         seconds = [e.seconds for e in self.exposures]
-        merged = merge_exposures(
-            [image for image, _, _ in read], seconds, [encoding for _, _, encoding in read]
-        )
-        return merged, np.logical_or.reduce([measured for _, measured, _ in read])
+        merged = merge_exposures(images, seconds, encodings)
+        return merged, kinds_of_bracket(kinds_of_each, seconds)
 
     def read_alpha(self) -> NDArray[np.float32] | None:
         """Alpha of the first file, (h, w) float32; None if it has none or is opaque."""
@@ -219,12 +219,8 @@ class Capture:
         check_matches(photograph.path, camera, image.shape[1], image.shape[0])
         return image
 
-    def read_measured(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Linear radiance of photograph `index`, and where it was measured.
-
-        A saturated or black-clipped value is no measurement, nor is what lies under alpha 0;
-        the rules are in `capture.clipping`. Of bracketed exposures one that measures is
-        enough.
+    def read_kinds(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Linear radiance of photograph `index`, and which of its values were measured.
 
         Parameters
         ----------
@@ -235,8 +231,8 @@ class Capture:
         -------
         radiance : (h, w, 3) float32
             As `read_photograph`; finite where nothing was measured, too.
-        measured : (h, w, 3) bool
-            Per channel: True where the value is a measurement.
+        kinds : (h, w, 3) uint8
+            Of `capture.clipping`. Of bracketed exposures one that measures is enough.
 
         Raises
         ------
@@ -244,10 +240,10 @@ class Capture:
             As `read_photograph`.
         """
         photograph = self.photographs[index]
-        image, measured = photograph.read_measured()
+        image, kinds = photograph.read_kinds()
         camera = self.cameras[photograph.camera]
         check_matches(photograph.path, camera, image.shape[1], image.shape[0])
-        return image, measured
+        return image, kinds
 
     def read_silhouette(self, view: int) -> NDArray[np.float32]:
         """Coverage of view `view` in [0, 1], (h, w) float32.

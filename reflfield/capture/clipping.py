@@ -22,12 +22,17 @@ At the lower end, code 0 of an integer file is "too dark". Floats have no lower 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
+Kinds = NDArray[np.uint8]
 
+# What a value is: measured; at the upper limit of sensor or file, so at least that; at code 0;
+# under alpha 0.
+MEASURED, SATURATED, BLACK, TRANSPARENT = range(4)
 PLATEAU_PIXELS = 16
 PLATEAU_SHARE = 1e-4
 PILE = 8
@@ -37,10 +42,10 @@ USUAL_CODES = tuple(
 )
 
 
-def measured_values(
+def kinds_of_stored(
     stored: Float32, *, integer: bool, white_level: float | None = None
-) -> Bool:
-    """Tell which stored values are measurements of radiance.
+) -> Kinds:
+    """Tell which stored values are measurements of radiance, and what the others are.
 
     Parameters
     ----------
@@ -53,23 +58,42 @@ def measured_values(
 
     Returns
     -------
-    (h, w, channels) bool
-        False where a value is at the upper limit, or at code 0 of an integer file.
+    (h, w, channels) uint8
+        `SATURATED` at the upper limit, `BLACK` at code 0 of an integer file, else `MEASURED`.
 
     Examples
     --------
     >>> photograph = np.array([[[0.0], [0.5], [1.0]]], np.float32)
-    >>> measured_values(photograph, integer=True)[0, :, 0].tolist()
-    [False, True, False]
+    >>> kinds_of_stored(photograph, integer=True)[0, :, 0].tolist()
+    [2, 0, 1]
     """
     limits = [
         _upper_limit(stored[..., i], integer) if white_level is None else white_level
         for i in range(stored.shape[2])
     ]
-    measured: Bool = stored < np.array(limits, np.float32)
+    kinds = np.where(stored < np.array(limits, np.float32), MEASURED, SATURATED)
     if integer:
-        measured &= stored > 0
-    return measured
+        kinds[stored <= 0] = BLACK
+    return kinds.astype(np.uint8)
+
+
+def kinds_of_bracket(shots: Sequence[Kinds], seconds: Sequence[float]) -> Kinds:
+    """Kinds of values of bracketed exposures together: one that measures is enough.
+
+    Else what the shortest says of a value that even it cannot hold counts, or else the longest.
+
+    Examples
+    --------
+    >>> short, long = np.array([0, 1, 2, 2], np.uint8), np.array([1, 1, 2, 0], np.uint8)
+    >>> kinds_of_bracket([long, short], [4.0, 0.5]).tolist()
+    [0, 1, 2, 0]
+    """
+    shortest, longest = shots[int(np.argmin(seconds))], shots[int(np.argmax(seconds))]
+    unmeasured = np.where(shortest == SATURATED, shortest, longest)
+    # Black in the shortest, white in the next: between the two, so no bound from below.
+    unmeasured[(unmeasured == SATURATED) & (shortest != SATURATED)] = BLACK
+    measured = np.logical_or.reduce([kinds == MEASURED for kinds in shots])
+    return np.where(measured, np.uint8(MEASURED), unmeasured)
 
 
 def _upper_limit(channel: Float32, integer: bool) -> float:

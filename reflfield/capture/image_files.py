@@ -18,7 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.clipping import measured_values
+from reflfield.capture.clipping import (
+    BLACK,
+    MEASURED,
+    SATURATED,
+    TRANSPARENT,
+    kinds_of_stored,
+)
 from reflfield.capture.color_spaces import ColorSpace
 from reflfield.capture.decoding import StoredImage, decode_stored, raw_size
 from reflfield.capture.encoding import LINEAR, SRGB, Encoding, encode_srgb
@@ -27,7 +33,7 @@ from reflfield.capture.image_layers import choose_layer
 from reflfield.errors import CaptureError
 
 Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
+Kinds = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -85,9 +91,9 @@ def read_image(
     return _linear(path, stored, reading, what)
 
 
-def read_measured(
+def read_kinds(
     path: Path | str, reading: ImageReading = AS_STATED, *, what: str = "photograph"
-) -> tuple[Float32, Bool]:
+) -> tuple[Float32, Kinds]:
     """Read an image as linear RGB, and which of its values are measurements.
 
     Parameters
@@ -99,19 +105,19 @@ def read_measured(
     -------
     image : (h, w, 3) float32
         As `read_image`.
-    measured : (h, w, 3) bool
-        False where a value is at a limit of the sensor or the file (`capture.clipping`), beyond
-        the last pair of a table, or under alpha 0.
+    kinds : (h, w, 3) uint8
+        Of `capture.clipping`: `MEASURED`; `SATURATED` at the limit of the sensor or the file,
+        or beyond the last pair of a table; `BLACK`; `TRANSPARENT` under alpha 0.
     """
     path = Path(path)
     stored = _read(path, reading)
     image = _linear(path, stored, reading, what)
-    return image, np.broadcast_to(_measured(stored, reading), image.shape)
+    return image, np.broadcast_to(_kinds(stored, reading), image.shape)
 
 
 def read_exposure(
     path: Path | str, reading: ImageReading = AS_STATED
-) -> tuple[Float32, Bool, Encoding]:
+) -> tuple[Float32, Kinds, Encoding]:
     """Read one of several bracketed exposures as stored: 1 is where it saturates.
 
     A file of floats is taken as linear up to the sensor's saturation at its white level (1 if
@@ -121,27 +127,24 @@ def read_exposure(
     -------
     encoded : (h, w, 3) float32
         In [0, 1].
-    measured : (h, w, 3) bool
-        As `read_measured`.
+    kinds : (h, w, 3) uint8
+        As `read_kinds`.
     encoding : Encoding
         From encoded to linear values.
     """
     path = Path(path)
     stored = _read(path, reading)
     image = _linear(path, stored, reading, "photograph")
-    measured = _measured(stored, reading)
+    kinds = np.broadcast_to(_kinds(stored, reading), image.shape)
     space = _space(stored, reading)
     if not stored.integer or stored.alpha is not None or space.matrix is not None:
         white = 1.0 if stored.integer else reading.white_level or 1.0
-        values = encode_srgb(image / np.float32(white)).astype(np.float32)
-        measured = measured & (values > 0) & (values < 1)
-        return values, measured, Encoding(SRGB)
-    shape = image.shape
-    return (
-        np.broadcast_to(stored.values, shape),
-        np.broadcast_to(measured, shape),
-        space.encoding,
-    )
+        share = image / np.float32(white)
+        values = encode_srgb(share).astype(np.float32)
+        limited = np.select([share <= 0, share >= 1], [BLACK, SATURATED], MEASURED)
+        kinds = np.where(kinds == MEASURED, limited.astype(np.uint8), kinds)
+        return values, kinds, Encoding(SRGB)
+    return np.broadcast_to(stored.values, image.shape), kinds, space.encoding
 
 
 def read_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> Float32 | None:
@@ -286,19 +289,19 @@ def _table(encoding: Encoding, largest_code: int) -> Float32:
     return encoding.decode(codes / np.float32(largest_code))
 
 
-def _measured(stored: StoredImage, reading: ImageReading) -> Bool:
-    """(h, w, 1 or 3): which stored values are no limits."""
+def _kinds(stored: StoredImage, reading: ImageReading) -> Kinds:
+    """(h, w, 1 or 3): which stored values are no limits, and what the others are."""
     values = stored.values
     level = reading.white_level
     if level is not None:
         level /= stored.largest_code
-    measured = measured_values(values, integer=stored.integer, white_level=level)
-    measured &= values <= np.float32(_space(stored, reading).encoding.top)
-    if stored.alpha is not None:
-        measured &= stored.alpha[..., None] > 0
+    kinds = kinds_of_stored(values, integer=stored.integer, white_level=level)
+    kinds[values > np.float32(_space(stored, reading).encoding.top)] = SATURATED
     if stored.saturated is not None:
-        measured &= ~stored.saturated[..., None]
-    return measured
+        kinds[stored.saturated] = SATURATED
+    if stored.alpha is not None:
+        kinds[stored.alpha <= 0] = TRANSPARENT
+    return kinds
 
 
 def _three_channels(values: Float32) -> Float32:

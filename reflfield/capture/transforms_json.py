@@ -64,6 +64,7 @@ class _Reading:
     cameras: _Unique = field(default_factory=_Unique)
     lights: _Unique = field(default_factory=_Unique)
     silhouettes: dict[int, Path] = field(default_factory=dict)
+    other_masks: dict[int, Path] = field(default_factory=dict)
     photographs: list[Photograph] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     said: dict[str, int] = field(default_factory=dict)
@@ -74,7 +75,9 @@ class _Reading:
         path = _image_path(self.files, frame)
         view, light = self._view(frame, path), self._light(frame)
         if frame.get("mask_path"):
-            self.silhouettes.setdefault(view, self.files.path(frame.get("mask_path")))
+            mask = self.files.path(frame.get("mask_path"))
+            if self.silhouettes.setdefault(view, mask) != mask:
+                self.other_masks.setdefault(view, mask)
         exposure = Exposure(path, reading=self._image_reading(frame))
         self.photographs.append(Photograph("", view, light, (exposure,), is_test=is_test))
 
@@ -155,7 +158,20 @@ def read_transforms(
     check_lights(used)
     for number, frame in enumerate(used):
         reading.add(frame, is_test=number >= len(train))
+    reading.notes += _mask_notes(reading, description)
     return _capture(reading, document, description)
+
+
+def _mask_notes(reading: _Reading, description: Path) -> list[str]:
+    """Say that of several masks of one camera the first is used."""
+    if not reading.other_masks:
+        return []
+    view, other = next(iter(reading.other_masks.items()))
+    return [
+        f"{description}: mask_path: {len(reading.other_masks)} of {len(reading.cameras.items)} "
+        f"cameras have several masks, of which the first is used ({reading.silhouettes[view]}, "
+        f"not {other})"
+    ]
 
 
 def _capture(reading: _Reading, document: Mapping[str, Any], description: Path) -> Capture:

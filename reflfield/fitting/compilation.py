@@ -41,6 +41,7 @@ def compile_kernels() -> None:
         entry=np.arange(2, dtype=np.int32),
         share=np.ones(2, np.float32),
         values=np.ones((2, 1, 3), np.float32),
+        at_least=np.zeros((2, 1, 3), np.bool_),
         views=up[:, 0].copy(),
         lights=up,
     )

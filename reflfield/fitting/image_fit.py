@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,11 +63,15 @@ class ImageFit:
         Diagonal of the tilts: how well each normal is determined.
     residual : float
         Root mean square of the weighted residuals before the step.
+    n_bounds, n_unmet : int
+        Saturated values, and those that the model was darker than before the step.
     """
 
     model: HalfVectorModel
     information: Array
     residual: float
+    n_bounds: int = 0
+    n_unmet: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +212,11 @@ def image_step(
         model=_changed(model, change),
         information=diagonal[:, 3 + model.n_lobes : 5 + model.n_lobes].mean(axis=1),
         residual=float(np.sqrt(sum(s.squares for s in starts) / n_values)),
+        n_bounds=sum(view.n_bounds for view in views),
+        n_unmet=sum(
+            int(np.count_nonzero(s.system.weight[view.at_least]))
+            for view, s in zip(views, starts, strict=True)
+        ),
     )
 
 
@@ -276,7 +286,7 @@ def pixel_rows(views: Sequence[ViewPixels], most: int, seed: int) -> TableRows:
     rng = np.random.default_rng(seed)
     share = min(1.0, most / max(total, 1))
     parts = [_rows_of(view, share, rng) for view in views]
-    counts, texel, weight, towards, lights, values = (
+    counts, texel, weight, towards, lights, values, at_least = (
         np.concatenate(arrays) for arrays in zip(*parts, strict=True)
     )
     return TableRows(
@@ -286,13 +296,14 @@ def pixel_rows(views: Sequence[ViewPixels], most: int, seed: int) -> TableRows:
         views=towards,
         lights=lights,
         values=values,
+        at_least=at_least,
     )
 
 
 def _rows_of(
     view: ViewPixels, share: float, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats, Floats, Floats, Floats]:
-    """Entries of each drawn value, then texel, share and directions of every entry, values."""
+) -> tuple[NDArray[Any], ...]:
+    """Entries of each drawn value; texel, share, directions of every entry; values, bounds."""
     pixel, light = np.nonzero(~np.isnan(view.values).all(axis=2))
     drawn = rng.random(len(pixel)) < share
     pixel, light = pixel[drawn], light[drawn]
@@ -308,4 +319,5 @@ def _rows_of(
         view.views[row],
         view.lights[row, np.repeat(light, counts)],
         view.values[pixel, light],
+        view.at_least[pixel, light],
     )

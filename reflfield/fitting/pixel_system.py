@@ -1,4 +1,9 @@
-"""Pixels of one view as weighted sums of the texels under them."""
+"""Pixels of one view as weighted sums of the texels under them.
+
+A saturated value says that the pixel is at least as bright. Its residual counts where the model
+is darker than that, and is zero where it is brighter: else highlights, whose middles no
+photograph holds, would be fitted to their rims alone.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +17,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
+from reflfield.capture.clipping import MEASURED, SATURATED
 from reflfield.capture.lights import Light
 from reflfield.field.half_vector import (
     FAST,
@@ -22,7 +28,7 @@ from reflfield.field.half_vector import (
     lobe_values,
     rotated,
 )
-from reflfield.fitting.robust_weights import HUBER, squared_weight
+from reflfield.fitting.robust_weights import HUBER, is_evidence, squared_weight
 from reflfield.observations.image_projection import facing_irradiance
 from reflfield.render.camera_rays import FieldSurface, subpixel_offsets
 
@@ -146,6 +152,8 @@ class ViewPixels:
     share : (n_entries,) float32
     values : (n_pixels, n_lights, 3) float32
         Radiance over irradiance, in units of white; NaN where not to be used.
+    at_least : (n_pixels, n_lights, 3) bool
+        True where a value is a bound from below: the pixel is saturated.
     views : (m, 3) float32
     lights : (m, n_lights, 3) float32
         Unit directions from each texel, world frame.
@@ -156,6 +164,7 @@ class ViewPixels:
     entry: NDArray[np.int32]
     share: Floats
     values: Floats
+    at_least: Bools
     views: Floats
     lights: Floats
 
@@ -163,6 +172,11 @@ class ViewPixels:
     def n_used(self) -> int:
         """Values that count, all channels of one as one."""
         return int(np.count_nonzero(~np.isnan(self.values).all(axis=2)))
+
+    @property
+    def n_bounds(self) -> int:
+        """Values that are bounds from below."""
+        return int(np.count_nonzero(~np.isnan(self.values[self.at_least])))
 
 
 def view_pixels(
@@ -192,14 +206,18 @@ def view_pixels(
     seen[footprint.texel] = True
     texels = np.flatnonzero(seen)
     values = np.full((len(footprint.pixels), len(shown), 3), np.nan, np.float32)
+    at_least = np.zeros(values.shape, np.bool_)
     lights = tuple(capture.lights[i] for i in shown)
     if len(values):
         irradiance, lit = _arriving(footprint, lights, positions, reliable[:, shown])
         row, column = footprint.pixels.T
         for i, photograph in enumerate(photographs[shown]):
-            image, measured = capture.read_measured(int(photograph))
+            image, kinds = capture.read_kinds(int(photograph))
             value = image[row, column] / (irradiance[:, i] * np.float32(white))
-            good = measured[row, column] & lit[:, [i]] & (irradiance[:, i] > 0)
+            kind = kinds[row, column]
+            at_least[:, i] = kind == SATURATED
+            known = (kind == MEASURED) | at_least[:, i]
+            good = known & lit[:, [i]] & (irradiance[:, i] > 0)
             values[:, i] = np.where(good, value, np.float32(np.nan))
     points = positions[texels]
     directions = [light.directions(points) for light in lights]
@@ -209,6 +227,7 @@ def view_pixels(
         entry=(np.cumsum(seen, dtype=np.int32) - 1)[footprint.texel],
         share=footprint.share,
         values=values,
+        at_least=at_least,
         views=capture.cameras[view].view_directions(points).astype(np.float32),
         lights=np.stack(directions, axis=1).astype(np.float32),
     )
@@ -363,13 +382,13 @@ def _add_diagonal(pixel: Any, j: int, geometry: Any, system: Any, diagonal: Any)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _weigh(values: Any, shown: Any, weight: Any) -> Any:
+def _weigh(values: Any, at_least: Any, shown: Any, weight: Any) -> Any:
     """Weights of one pixel's channels; `shown` becomes the weighted residual; its square."""
     error = 0.0
     for c in range(3):
         weight[c] = np.float32(0.0)
         residual = np.float32(0.0)
-        if not np.isnan(values[c]):
+        if is_evidence(values[c], at_least[c], shown[c]):
             weight[c] = squared_weight(values[c], shown[c], HUBER)
             residual = values[c] - shown[c]
             error += weight[c] * residual * residual
@@ -378,19 +397,20 @@ def _weigh(values: Any, shown: Any, weight: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _start(geometry: Any, values: Any, x: Any, system: Any, right: Any, diagonal: Any) -> Any:
+def _start(geometry: Any, observed: Any, x: Any, system: Any, right: Any, diagonal: Any) -> Any:
     """Weights of values from residuals at x; right side, diagonal; sum of squares, count."""
     weight = system[3]
+    values, at_least = observed
     residual = np.zeros(3, np.float32)
     error, count = 0.0, 0
     for pixel in range(values.shape[0]):
         for j in range(values.shape[1]):
-            measured = 3 - np.isnan(values[pixel, j]).sum()
-            if measured == 0:
+            if np.isnan(values[pixel, j]).all():
                 continue
-            count += measured
             _pixel_value(pixel, j, geometry, x, system, residual)
-            error += _weigh(values[pixel, j], residual, weight[pixel, j])
+            error += _weigh(values[pixel, j], at_least[pixel, j], residual, weight[pixel, j])
+            for c in range(3):
+                count += weight[pixel, j, c] > 0
             _add_adjoint(pixel, j, geometry, residual, system, right)
             _add_diagonal(pixel, j, geometry, system, diagonal)
     return error, count
@@ -407,7 +427,7 @@ class PixelStart:
     squares : float
         Sum of the weighted squared residuals.
     count : int
-        Of the values.
+        Of the values that count.
     """
 
     system: Linearisation
@@ -443,7 +463,8 @@ def linearised(
     x[:, 3 : 3 + model.n_lobes] = model.weights[pixels.texels]
     right, diagonal = np.zeros_like(x), np.zeros_like(x)
     system.weight[:] = 0
-    squares, count = _start(_geometry(pixels), pixels.values, x, system.arrays, right, diagonal)
+    observed = (pixels.values, pixels.at_least)
+    squares, count = _start(_geometry(pixels), observed, x, system.arrays, right, diagonal)
     return PixelStart(system, right, diagonal, squares, count)
 
 

@@ -13,6 +13,15 @@ from reflfield.field.half_vector import FAST
 HUBER, TABLE_HUBER = np.float32(0.1), np.float32(0.15)
 
 
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def is_evidence(value: Any, at_least: Any, predicted: Any) -> Any:
+    """Whether a value says something against a prediction: not one that is unknown (NaN).
+
+    One that is a bound from below (`at_least`) says nothing against what is above it.
+    """
+    return not np.isnan(value) and not (at_least and predicted >= value)
+
+
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
 def display_weight(value: Any) -> Any:
     """Weight of a residual at a value in units of white.

@@ -61,6 +61,8 @@ class TableRows:
         Unit directions, world frame.
     values : (n_rows, 3) float32
         In units of white; NaN where not measured.
+    at_least : (n_rows, 3) bool
+        True where a value is a bound from below.
     """
 
     first: NDArray[np.int64]
@@ -69,6 +71,7 @@ class TableRows:
     views: Floats
     lights: Floats
     values: Floats
+    at_least: NDArray[np.bool_]
 
     @property
     def n_rows(self) -> int:
@@ -286,7 +289,8 @@ def _linearised(
     def one(part: slice) -> None:
         linearise_rows(
             rows.first[part.start : part.stop + 1],
-            *(rows.texel, rows.share, rows.views, rows.lights, rows.values[part]),
+            *(rows.texel, rows.share, rows.views, rows.lights),
+            (rows.values[part], rows.at_least[part]),
             *(model.arrays, taps, linearised.factor, linearised.weight[part]),
         )
 

@@ -19,7 +19,7 @@ from reflfield.field.half_vector import (
     half_taps,
     lobe_values,
 )
-from reflfield.fitting.robust_weights import TABLE_HUBER, squared_weight
+from reflfield.fitting.robust_weights import TABLE_HUBER, is_evidence, squared_weight
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -29,7 +29,7 @@ def linearise_rows(
     share: Any,
     views: Any,
     lights: Any,
-    values: Any,
+    observed: Any,
     model: Any,
     taps: Any,
     factor: Any,
@@ -40,6 +40,7 @@ def linearise_rows(
     lobe_node, lobe_share, diffuse_node, diffuse_share = taps
     part = np.zeros((lobes.shape[0], 3), np.float32)
     shown = np.zeros(3, np.float32)
+    values, at_least = observed
     for row in range(len(values)):
         shown[:] = np.float32(0.0)
         for e in range(first[row], first[row + 1]):
@@ -58,9 +59,8 @@ def linearise_rows(
                 for k in range(lobes.shape[0]):
                     shown[c] += weights[t, k] * part[k, c]
         for c in range(3):
-            if np.isnan(values[row, c]):
-                continue
-            weight[row, c] = squared_weight(values[row, c], shown[c], TABLE_HUBER)
+            if is_evidence(values[row, c], at_least[row, c], shown[c]):
+                weight[row, c] = squared_weight(values[row, c], shown[c], TABLE_HUBER)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)

@@ -349,6 +349,7 @@ def sample_rows(blocks: SampleBlocks, most: int, seed: int) -> TableRows:
         views=views,
         lights=lights,
         values=values,
+        at_least=np.zeros(values.shape, np.bool_),
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.clipping import MEASURED
 from reflfield.capture.image_files import read_image
 from reflfield.errors import NumericalError
 from reflfield.field.reflectance_field import ReflectanceField
@@ -41,14 +42,14 @@ class RelitPairs:
 
     def __iter__(self) -> Iterator[ImagePair]:
         for i, photograph in enumerate(self.frames.photographs):
-            radiance, measured = self.frames.read_measured(i)
+            radiance, kinds = self.frames.read_kinds(i)
             yield ImagePair(
                 name=photograph.name,
                 photograph=radiance,
                 relit=read_image(self.folder / f"{photograph.name}.exr"),
                 silhouette=self.silhouettes.read(photograph.camera),
                 # What is too dark to measure is as good as black; what is too bright is not.
-                excluded=np.any(~measured & (radiance > 0), axis=-1, keepdims=True)[..., 0],
+                excluded=np.any((kinds != MEASURED) & (radiance > 0), axis=-1),
                 silhouette_from=self.silhouettes.origins[photograph.camera],
             )
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.clipping import BLACK
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.observations.store import (
@@ -27,8 +28,9 @@ from reflfield.util.validation import check_shape
 
 Floats = NDArray[np.float32]
 Kinds = NDArray[np.uint8]
-# What a value of a photograph at a texel may be: measured; at the upper limit of sensor or
-# file; at code 0; under alpha 0; of a colour that the light has not; where it gives nothing.
+# What a value of a photograph at a texel may be. As `capture.clipping` has it: measured; at the
+# upper limit of sensor or file; at code 0; under alpha 0. And of a colour that the light has
+# not; where it gives nothing.
 VALUE_KINDS = ("measured", "saturated", "black", "transparent", "dark", "unlit")
 # Those that say nothing of the sample.
 NOT_MEASURED = ("saturated", "transparent", "dark")
@@ -202,8 +204,8 @@ class Projected:
         what they are: see `VALUE_KINDS`.
     measured : (n_texels, n_lights) bool
         True where some camera measured a value under the light.
-    brightest : float
-        Largest sample, 1/sr; 0 where everything is dark.
+    brightest, darkest : float
+        Largest and smallest sample, 1/sr; 0 where all is dark, where nothing is negative.
     looked_into : LookedInto
         Some of the samples.
     """
@@ -212,6 +214,7 @@ class Projected:
     values: NDArray[np.int64]
     measured: NDArray[np.bool_]
     brightest: float
+    darkest: float
     looked_into: LookedInto
 
     def count(self, kind: str) -> int:
@@ -259,15 +262,18 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         intact=has_views,
         at_once=at_once,
     )
-    n_photographs, values, brightest = 0, [], 0.0
+    n_photographs, values, brightest, darkest = 0, [], 0.0, 0.0
     measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
     for part in parts:
         n_photographs += int(part["photographs"])
         values.append(part["values"])
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
+        darkest = min(darkest, float(part["darkest"]))
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
-    projected = Projected(n_photographs, np.concatenate(values), bits, brightest, first)
+    projected = Projected(
+        n_photographs, np.concatenate(values), bits, brightest, darkest, first
+    )
     n_gaps = sum(projected.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(projected.values.sum()), 1))
     return projected
@@ -282,7 +288,7 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
     measured = np.zeros((len(points), n_lights), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
-    n_read, brightest = 0, 0.0
+    n_read, brightest, darkest = 0, 0.0, 0.0
     for i, view in enumerate(views):
         seen = np.flatnonzero(projection.visible[:, view])
         for lights, values, kinds in _view_samples(
@@ -294,12 +300,14 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
             measured[seen[:, None], lights] |= IS_KNOWN[kinds].any(axis=2)
             n_read += len(lights)
             brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
+            darkest = min(darkest, float(np.fmin.reduce(values, axis=None, initial=0.0)))
     store[:, views.start : views.stop] = block
     return {
         "photographs": np.array(n_read),
         "values": counts,
         "measured": np.packbits(measured, axis=1),
         "brightest": np.array(brightest),
+        "darkest": np.array(darkest),
     }
 
 
@@ -317,9 +325,11 @@ def has_views(projection: Projection, views: range) -> bool:
 
 
 def look_into(projection: Projection) -> LookedInto:
-    """Samples of a few photographs, spread evenly over the capture, at texels spread so."""
+    """Samples of a few photographs, spread over lights and views, at texels spread evenly."""
     capture, n = projection.capture, len(projection.capture.photographs)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
+    order = sorted(range(n), key=lambda i: (capture.photographs[i].light, i))
+    places = np.unique(np.linspace(0, n - 1, min(n, PHOTOGRAPHS_FOR_UNIT)).astype(int))
+    chosen = np.sort(np.array(order)[places])
     columns = []
     for index in chosen:
         photograph = capture.photographs[index]
@@ -375,9 +385,8 @@ def _samples_at(
     images = np.zeros((len(lights), camera.height, camera.width, 3), np.float32)
     kinds = np.zeros((len(points), len(lights), 3), np.uint8)
     for j, index in enumerate(indices):
-        image, measured = capture.read_measured(int(index))
-        if not measured.all():
-            of_pixels = pixel_kinds(image, measured)
+        image, of_pixels = capture.read_kinds(int(index))
+        if of_pixels.any():
             image = with_bounded_black(image, of_pixels)
             _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
         images[j] = image
@@ -396,31 +405,17 @@ def _samples_at(
     return values, kinds
 
 
-def pixel_kinds(image: Floats, measured: NDArray[np.bool_]) -> Kinds:
-    """Of what kind each value (h, w, 3) of a photograph is: a place in `VALUE_KINDS`.
-
-    A value that is no measurement is black where it is zero, saturated where it is at least
-    half of the largest of its channel, and else lies under alpha 0.
-    """
-    bright = image >= 0.5 * image.max(axis=(0, 1))
-    kinds = np.full(image.shape, VALUE_KINDS.index("transparent"), np.uint8)
-    kinds[bright] = VALUE_KINDS.index("saturated")
-    kinds[image <= 0] = VALUE_KINDS.index("black")
-    kinds[measured] = 0
-    return kinds
-
-
 def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
     """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
 
     Examples
     --------
     >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
-    >>> kinds = pixel_kinds(image, image > 0)
+    >>> kinds = np.where(image > 0, 0, BLACK)
     >>> with_bounded_black(image, kinds)[0, 0].round(3)
     array([0.105, 0.021, 0.211], dtype=float32)
     """
-    black = kinds == VALUE_KINDS.index("black")
+    black = kinds == BLACK
     if not black.any():
         return image
     positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)

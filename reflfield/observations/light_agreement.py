@@ -4,13 +4,18 @@ Lights that are described in other axes than the cameras are (y up for z up, a m
 the axes of each camera) light the surface from elsewhere than the photographs show. Then the
 brightness of the surface does not follow the cosine to the light, but does once the lights are
 read in those other axes.
+
+Outlines show no hollows: the hull closes them with a surface that faces their opening. What is
+seen through it, the inside of a bowl, is bright on the far side from the light, as that surface
+would be if the light stood turned by half about the way that it faces. Where lights turned so
+fit as well as any other axes, the surface that faces sideways tells the two apart.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +32,10 @@ Array = NDArray[np.float64]
 LEAST_IF_MEANT, LEAST_LEAD = 0.35, 0.25
 # A mean over so many photographs is below this only if something is wrong.
 LEAST_AS_DESCRIBED, FEWEST_LOOKS = -0.05, 8
+# A hollow is an explanation if another reading leads by less.
+HOLLOW_TIE = 0.1
+# Normals at a smaller cosine to the way that a hollow opens are beside it.
+BESIDE = 0.7
 # Points of a photograph, and spread of their cosines, that say something.
 FEWEST_POINTS, LEAST_SPREAD = 32, 0.05
 _OPENGL = np.array([1.0, -1.0, -1.0])  # its camera axes from OpenCV's
@@ -90,7 +99,7 @@ def other_light_axes(looks: list[Look]) -> str:
     str
         Empty where the lights fit as described, or nothing fits better.
     """
-    described = agreement(looks, _as_described)
+    described = agreement(looks, as_described)
     if described is None or described > 1 - LEAST_LEAD:
         return ""
     so_far = (
@@ -99,6 +108,9 @@ def other_light_axes(looks: list[Look]) -> str:
     )
     scores = {words: agreement(looks, reading) or -1.0 for words, reading in _readings()}
     words, best = max(scores.items(), key=lambda item: item[1])
+    hollow = _hollow(looks, max(best, described + LEAST_LEAD))
+    if hollow is not None:
+        return hollow and f"{so_far}{hollow}"
     if best >= max(LEAST_IF_MEANT, described + LEAST_LEAD):
         return (
             f"{so_far}, but of {best:.2f} with the lights' coordinates {words}; check the axes "
@@ -112,6 +124,52 @@ def other_light_axes(looks: list[Look]) -> str:
     return ""
 
 
+def _hollow(looks: list[Look], others: float) -> str | None:
+    """Words on a hollow that explains the photographs; None where none does.
+
+    Empty where the surface beside it fits the lights as described, which settles it.
+    """
+    normals = np.concatenate([look.normals for look in looks])
+    opening = normals.mean(axis=0)
+    opening /= max(float(np.linalg.norm(opening)), 1e-9)
+    middle = np.concatenate([look.points for look in looks]).mean(axis=0)
+    turned = _half_turn(opening, middle)
+    inside = agreement(looks, turned)
+    if inside is None or inside < max(LEAST_IF_MEANT, others - HOLLOW_TIE):
+        return None
+    beside = [_part(look, np.abs(look.normals @ opening) < BESIDE) for look in looks]
+    told, otherwise = agreement(beside, as_described), agreement(beside, turned)
+    if told is None or otherwise is None:
+        axis = ", ".join(f"{x:z.1f}" for x in opening)
+        return (
+            f", but of {inside:.2f} with the lights turned by half about ({axis}); either the "
+            "object is hollow there, which its outlines do not show, or the axes of lights and "
+            "cameras differ"
+        )
+    return "" if told > otherwise else None
+
+
+def _part(look: Look, chosen: NDArray[np.bool_]) -> Look:
+    """Some of the points of a look."""
+    return replace(
+        look,
+        points=look.points[chosen],
+        normals=look.normals[chosen],
+        brightness=look.brightness[chosen],
+    )
+
+
+def _half_turn(axis: Array, middle: Array) -> Reading:
+    """Lights turned by half about an axis through a point."""
+
+    def reading(vector: Array, camera: Camera, is_position: bool) -> Array:
+        from_middle = vector - middle if is_position else vector
+        turned: Array = 2 * (from_middle @ axis) * axis - from_middle
+        return turned + middle if is_position else turned
+
+    return reading
+
+
 def agreement(looks: list[Look], reading: Reading) -> float | None:
     """Mean correlation of brightness and cosine to the light; None where nothing tells."""
     correlations = [_correlation(look, reading) for look in looks]
@@ -120,16 +178,9 @@ def agreement(looks: list[Look], reading: Reading) -> float | None:
 
 
 def _correlation(look: Look, reading: Reading) -> float | None:
-    light = look.light
-    if light.kind not in (POINT, SPOT, DIRECTIONAL):
-        return None
-    at = light.kind != DIRECTIONAL
-    place = reading(light.position if at else light.direction, look.camera, at)
-    towards = place - look.points if at else np.broadcast_to(place, look.points.shape)
-    length = np.linalg.norm(towards, axis=1)
-    cosine = np.maximum((towards * look.normals).sum(axis=1) / np.maximum(length, 1e-300), 0.0)
+    cosine = cosines(look, reading)
     known = np.isfinite(look.brightness)
-    if known.sum() < FEWEST_POINTS:
+    if cosine is None or known.sum() < FEWEST_POINTS:
         return None
     x, y = cosine[known], np.sqrt(np.maximum(look.brightness[known], 0.0))
     if y.std() == 0:
@@ -139,7 +190,20 @@ def _correlation(look: Look, reading: Reading) -> float | None:
     return float(np.corrcoef(x, y)[0, 1])
 
 
-def _as_described(vector: Array, camera: Camera, is_position: bool) -> Array:
+def cosines(look: Look, reading: Reading) -> Array | None:
+    """Cosine (n,) to the light at each point, 0 on its other side; None if it is unknown."""
+    light = look.light
+    if light.kind not in (POINT, SPOT, DIRECTIONAL):
+        return None
+    at = light.kind != DIRECTIONAL
+    place = reading(light.position if at else light.direction, look.camera, at)
+    towards = place - look.points if at else np.broadcast_to(place, look.points.shape)
+    length = np.linalg.norm(towards, axis=1)
+    return np.maximum((towards * look.normals).sum(axis=1) / np.maximum(length, 1e-300), 0.0)
+
+
+def as_described(vector: Array, camera: Camera, is_position: bool) -> Array:
+    """Reading of what is in the world's axes."""
     return vector
 
 

@@ -18,9 +18,11 @@ Bools = NDArray[np.bool_]
 MEASURED = "measured.npz"
 # Less than this share of the values that cameras see is a trace.
 TRACE = 1e-3
+# Noise about a black that was subtracted goes below 0, but not by this share of the brightest.
+NEGATIVE = 0.1
 # What is told of, and the remedy. Not of black: an object has sides that no light reaches.
 TOLD = {
-    "saturated": "saturated and left out; expose shorter, or bracket",
+    "saturated": "saturated, known only to be at least as bright; expose shorter, or bracket",
     "transparent": "under alpha 0 and left out; check silhouettes and cameras",
 }
 
@@ -61,7 +63,16 @@ def check_measured(capture: Capture, projected: Projected) -> None:
 
 
 def clipping_lines(capture: Capture, projected: Projected) -> Iterator[str]:
-    """Say of what is more than a trace how much there is, and which camera has most."""
+    """Say of what is more than a trace how much there is, and which camera has most.
+
+    And of values so far below 0 that they are no radiance.
+    """
+    if projected.darkest < -NEGATIVE * projected.brightest:
+        yield (
+            "photographs: values on the object are negative, down to "
+            f"{projected.darkest / projected.brightest:.0%} of the brightest; check that the "
+            "files, or their layers, are photographs, and what was subtracted from them"
+        )
     seen = np.maximum(projected.values.sum(axis=1), 1)
     for kind, text in TOLD.items():
         counts = projected.values[:, VALUE_KINDS.index(kind)]

@@ -80,7 +80,7 @@ SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 8, 1 / 4
 # Pixels under a light that are fitted to at most: more would take hours.
 MOST_PIXELS = 32_000_000
 # Memory of a pixel under a light, and of a pixel with the texels under it.
-VALUE_BYTES, FOOTPRINT_BYTES = 12, 100
+VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
 # In its record.
@@ -393,12 +393,14 @@ def fitted_on_surface(fit: HalfVectorFit, folder: Path) -> ImageFit:
 def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) -> ImageFit:
     def fitted() -> dict[str, NDArray[Any]]:
         image_fit = fit.to_photographs(model, folder)
-        extra = {"information": image_fit.information, "residual": np.array(image_fit.residual)}
+        numbers = ("information", "residual", "n_bounds", "n_unmet")
+        extra = {name: np.asarray(getattr(image_fit, name)) for name in numbers}
         return arrays_of(image_fit.model) | extra
 
     stored: dict[str, Any] = fit.context.blocks(folder).once("fit to the photographs", fitted)
     information, residual = stored.pop("information"), float(stored.pop("residual"))
-    return ImageFit(HalfVectorModel(**stored), information, residual)
+    counts = int(stored.pop("n_bounds")), int(stored.pop("n_unmet"))
+    return ImageFit(HalfVectorModel(**stored), information, residual, *counts)
 
 
 def lobe_counts(fit: HalfVectorFit, folder: Path) -> dict[str, Any]:
@@ -419,7 +421,8 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     context = context.refined
     fit = HalfVectorFit(context)
     on_hull = not context.on_surface
-    model = (fitted_on_hull if on_hull else fitted_on_surface)(fit, folder).model
+    fitted = (fitted_on_hull if on_hull else fitted_on_surface)(fit, folder)
+    model = fitted.model
     made = fit.made(model)
     write_field(folder / "field.rfld", made)
     write_model(folder / MODEL, model, fit.white)
@@ -436,6 +439,8 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
         **(lobe_counts(fit, folder) if on_hull else {}),
+        "saturated values, fitted as bounds from below": fitted.n_bounds,
+        "of them fitted darker": fitted.n_unmet,
         **made.counts,
         "field bytes": size,
         "raw bytes": raw,

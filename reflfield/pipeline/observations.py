@@ -13,6 +13,7 @@ from reflfield.observations.image_projection import (
     Projection,
     project_photographs,
 )
+from reflfield.observations.intensity_agreement import other_intensities
 from reflfield.observations.light_agreement import looks_at, other_light_axes
 from reflfield.observations.store import Location, open_samples, place_of
 from reflfield.pipeline import results
@@ -65,18 +66,19 @@ def new_samples_location(context: Context, folder: Path) -> Location:
 
 
 def misread_lights(context: Context, samples: LookedInto) -> list[str]:
-    """Return a warning where the lights are plainly in other axes than the cameras."""
+    """Return warnings where lights are plainly in other axes, or of other intensities."""
     if context.is_plane:  # all its points face one way
         return []
-    looks = looks_at(
-        context.training,
-        samples.photograph,
-        results.texels(context).position[samples.texel],
-        results.texels(context).normal[samples.texel],
-        samples.brightness(),
+    looks = list(
+        looks_at(
+            context.training,
+            samples.photograph,
+            results.texels(context).position[samples.texel],
+            results.texels(context).normal[samples.texel],
+            samples.brightness(),
+        )
     )
-    warning = other_light_axes(list(looks))
-    return [warning] if warning else []
+    return [words for words in (other_light_axes(looks), other_intensities(looks)) if words]
 
 
 def lost_observations(context: Context, folder: Path) -> str:

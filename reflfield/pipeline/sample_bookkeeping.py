@@ -89,7 +89,7 @@ def _values(context: Context, projected: dict[str, Any]) -> CountedItems:
     pairs = results.observed(context).pairs.sum(axis=1)
     names = {
         "measured": "measured",
-        "saturated": "saturated: left out",
+        "saturated": "saturated: at least as bright, left out of the samples",
         "black": "at code 0: counted as too dark for the file",
         "transparent": "under alpha 0: left out",
         "dark": "of a colour that the light has not: left out",

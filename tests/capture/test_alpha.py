@@ -8,8 +8,9 @@ import pytest
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.clipping import MEASURED, TRANSPARENT
 from reflfield.capture.encoding import decode_srgb, encode_srgb
-from reflfield.capture.image_files import read_alpha, read_image, read_measured
+from reflfield.capture.image_files import read_alpha, read_image, read_kinds
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.inspect import describe
 from reflfield.capture.lights import Light
@@ -66,13 +67,13 @@ class TestReading:
     def test_the_object_before_black(self, tmp_path, radiance, alpha, name):
         """Colour times alpha in all formats, and black where alpha is 0."""
         save(tmp_path / name, radiance, alpha)
-        image, measured = read_measured(tmp_path / name)
+        image, kinds = read_kinds(tmp_path / name)
         expected = radiance * alpha[..., None]
         # half a step of 16 bits, by the slope of sRGB of at most 2.3, more where alpha divides
         np.testing.assert_allclose(image, expected, atol=1e-4)
         assert not image[alpha == 0].any()
-        assert not measured[alpha == 0].any()
-        assert measured[alpha == 1].all()
+        assert (kinds[alpha == 0] == TRANSPARENT).all()
+        assert (kinds[alpha == 1] == MEASURED).all()
         np.testing.assert_allclose(read_alpha(tmp_path / name), alpha, atol=1e-5)
 
     @pytest.mark.parametrize("name", ["a.exr", "a.png", "straight.tif"])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from reflfield.capture import decoding
-from reflfield.capture.image_files import image_size, read_image, read_measured
+from reflfield.capture.clipping import MEASURED, SATURATED
+from reflfield.capture.image_files import image_size, read_image, read_kinds
 from reflfield.errors import CaptureError
 from tests.capture.tiff_files import strips_of, tags_of, write_tiff
 
@@ -73,11 +74,11 @@ def test_developed_linear(tmp_path, name):
     pytest.importorskip("rawpy")
     write_dng(tmp_path / name)
     assert image_size(tmp_path / name) == (96, 64)
-    image, measured = read_measured(tmp_path / name)
+    image, kinds = read_kinds(tmp_path / name)
     np.testing.assert_allclose(image[32, 20], LEFT, atol=1e-4)  # two steps of 16 bits
     np.testing.assert_allclose(image[32, 76], (0.5, 0.25, 1), atol=1e-4)
-    assert measured[32, 20].all()
-    assert not measured[32, 76].any()  # the matrix mixes channels
+    assert (kinds[32, 20] == MEASURED).all()
+    assert (kinds[32, 76] == SATURATED).all()  # the matrix mixes channels
 
 
 def test_white_balance_of_the_camera(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture, Exposure, Photograph
-from reflfield.capture.clipping import measured_values
+from reflfield.capture.clipping import BLACK, MEASURED, SATURATED, TRANSPARENT, kinds_of_stored
 from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
@@ -34,38 +34,39 @@ def test_integers_at_either_end_are_no_measurements(tmp_path, radiance, dtype, t
     codes = np.rint(np.clip(encode_srgb(radiance), 0, 1) * top)
     codes[0, :5, 1] = 0
     write_png(tmp_path / "a.png", codes.astype(dtype))
-    image, measured = capture_of(tmp_path, ("a.png", 1.0)).read_measured(0)
+    image, kinds = capture_of(tmp_path, ("a.png", 1.0)).read_kinds(0)
+    measured = kinds == MEASURED
     assert np.array_equal(measured, (codes > 0) & (codes < top))
     assert np.array_equal(image[measured], image[measured].clip(0, 0.99999))
 
 
 def test_floats_saturated_at_one(tmp_path, radiance):
     write_exr(tmp_path / "a.exr", np.minimum(radiance, 1))
-    _, measured = capture_of(tmp_path, ("a.exr", 0.5)).read_measured(0)
-    assert np.array_equal(measured, radiance < 1)
+    _, kinds = capture_of(tmp_path, ("a.exr", 0.5)).read_kinds(0)
+    assert np.array_equal(kinds == MEASURED, radiance < 1)
 
 
 @pytest.mark.parametrize("level", [0.37, 1.3])
 def test_floats_saturated_at_another_level(radiance, level):
     level = np.float32(level)
-    measured = measured_values(np.minimum(radiance, level), integer=False)
+    measured = kinds_of_stored(np.minimum(radiance, level), integer=False) == MEASURED
     assert np.array_equal(measured, radiance < level)
 
 
 @pytest.mark.parametrize("shift", [0, 4])
 def test_12_bits_in_16(radiance, shift):
     codes = np.clip(np.rint(radiance * 4095), 0, 4095).astype(np.uint16) << shift
-    measured = measured_values(codes.astype(np.float32) / 65535, integer=True)
+    measured = kinds_of_stored(codes.astype(np.float32) / 65535, integer=True) == MEASURED
     assert np.array_equal(measured, (codes < (4095 << shift)) & (codes > 0))
 
 
 def test_black_floats_are_measured(radiance):
     radiance[:3] = 0
-    assert measured_values(radiance, integer=False).all()
+    assert not kinds_of_stored(radiance, integer=False).any()
 
 
 def test_white_level_said(radiance):
-    measured = measured_values(radiance, integer=False, white_level=0.8)
+    measured = kinds_of_stored(radiance, integer=False, white_level=0.8) == MEASURED
     assert np.array_equal(measured, radiance < np.float32(0.8))
 
 
@@ -75,7 +76,7 @@ def test_equal_values_that_are_no_limit(radiance):
     plate = np.zeros((SIZE, SIZE, 3), np.float32)
     plate[9:30, 9:30] = 0.4
     for image in (radiance, ramp, np.dstack([tiles] * 3), plate, np.ones_like(ramp)):
-        assert measured_values(image, integer=False).all()
+        assert not kinds_of_stored(image, integer=False).any()
 
 
 def test_one_of_the_bracketed_exposures_is_enough(tmp_path, radiance):
@@ -84,12 +85,13 @@ def test_one_of_the_bracketed_exposures_is_enough(tmp_path, radiance):
     codes = {n: np.rint(255 * encode_srgb(np.clip(radiance * t, 0, 1))) for n, t in files}
     for name, code in codes.items():
         write_png(tmp_path / name, code.astype(np.uint8))
-    image, measured = capture_of(tmp_path, *files).read_measured(0)
+    image, kinds = capture_of(tmp_path, *files).read_kinds(0)
+    measured = kinds == MEASURED
     between = [(c > 0) & (c < 255) for c in codes.values()]
     assert np.array_equal(measured, between[0] | between[1])
     assert measured[SIZE // 2, SIZE // 2].all()  # saturated in the long one
-    assert not measured[0, 0].any()  # black in both
-    assert not measured[0, -1].any()  # saturated in both
+    assert (kinds[0, 0] == BLACK).all()  # in both
+    assert (kinds[0, -1] == SATURATED).all()  # in both
     np.testing.assert_allclose(image[measured], radiance[measured], rtol=0.1)  # 8 bits
 
 
@@ -97,6 +99,6 @@ def test_under_alpha_nothing_is_measured(tmp_path):
     codes = np.full((SIZE, SIZE, 4), 90, np.uint8)
     codes[:, :7, 3] = 0
     assert cv2.imwrite(str(tmp_path / "a.png"), codes)
-    _, measured = capture_of(tmp_path, ("a.png", 1.0)).read_measured(0)
-    assert not measured[:, :7].any()
-    assert measured[:, 7:].all()
+    _, kinds = capture_of(tmp_path, ("a.png", 1.0)).read_kinds(0)
+    assert (kinds[:, :7] == TRANSPARENT).all()
+    assert (kinds[:, 7:] == MEASURED).all()

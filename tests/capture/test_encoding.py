@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from reflfield.capture.clipping import BLACK, MEASURED, SATURATED
 from reflfield.capture.encoding import Encoding, decode_srgb, parse_encoding, read_pairs
-from reflfield.capture.image_files import ImageReading, read_image, read_measured
+from reflfield.capture.image_files import ImageReading, read_image, read_kinds
 from reflfield.capture.image_writing import write_png
 from reflfield.capture.readers import open_capture
 from reflfield.cli import app
@@ -78,13 +79,15 @@ class TestCurves:
         path = tmp_path / ("pairs.vset" if form == "vset" else "pairs.csv")
         path.write_text(texts[form])
         reading = ImageReading(encoding=parse_encoding(str(path)))
-        image, measured = read_measured(codes, reading)
+        image, kinds = read_kinds(codes, reading)
         values = image[0, :, 0]
         for linear, code in MUNSELL:
             assert values[code] == pytest.approx(linear, rel=1e-5)
         assert values[0] == 0
         assert (np.diff(values) > 0).all()
-        assert measured[0, :, 0].tolist() == [0 < code <= 186 for code in range(256)]
+        # Of the curve beyond the last pair only that it rises is known, whatever value it has.
+        expected = [BLACK] + [MEASURED] * 186 + [SATURATED] * 69
+        assert kinds[0, :, 0].tolist() == expected
 
     @pytest.mark.parametrize(
         "text", ["", "SRGB?", "gamma=", "gamma=nan", "gamma=0", "gamma=99", "pairs", "a.exe"]
@@ -133,9 +136,9 @@ class TestStated:
         capture = rewritten(
             encoded_capture, lambda d: d.update(encoding="pairs.csv", white_level=32768)
         )
-        image, measured = capture.read_measured(0)
+        image, kinds = capture.read_kinds(0)
         assert image[0, 0, 0] == pytest.approx(0.1, rel=1e-3)  # 32768 is a little above half
-        assert not measured.any()
+        assert (kinds == SATURATED).all()
 
     def test_transforms(self, encoded_capture):
         frame = {

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from reflfield.capture import image_headers
+from reflfield.capture.clipping import BLACK, MEASURED, SATURATED
 from reflfield.capture.encoding import decode_srgb, encode_srgb
 from reflfield.capture.exposures import merge_exposures
 from reflfield.capture.image_files import image_size, read_coverage, read_exposure, read_image
@@ -201,12 +202,13 @@ class TestExposures:
 
     def test_grey_and_exr_exposures(self, tmp_path):
         write_png(tmp_path / "g.png", np.array([[0, 51, 255]], np.uint8))
-        grey, measured, _ = read_exposure(tmp_path / "g.png")
-        assert measured[0, :, 2].tolist() == [False, True, False]
+        grey, kinds, _ = read_exposure(tmp_path / "g.png")
+        assert kinds[0, :, 2].tolist() == [BLACK, MEASURED, SATURATED]
         np.testing.assert_allclose(grey[0, :, 2], [0, 0.2, 1], rtol=1e-6)
         write_exr(tmp_path / "e.exr", np.array([[[0.0, 0.214041, 5.0]]], np.float32))
-        linear, _, _ = read_exposure(tmp_path / "e.exr")
+        linear, kinds, _ = read_exposure(tmp_path / "e.exr")
         np.testing.assert_allclose(linear, [[[0, 0.5, 1]]], atol=1e-6)
+        assert kinds[0, 0].tolist() == [BLACK, MEASURED, SATURATED]
 
     def test_saturated_and_black_everywhere(self):
         white, black = np.ones((1, 1, 3), np.float32), np.zeros((1, 1, 3), np.float32)

@@ -58,6 +58,19 @@ class TestTransforms:
         assert capture.photograph_index.tolist() == [[0, 1], [2, -1]]
         assert [p.name for p in capture.photographs] == ["a", "x", "y"]
 
+    def test_the_first_of_several_masks_of_a_camera_is_used_and_said(self, tmp_path):
+        frames = [
+            frame("a", mask_path="m/a.png"),
+            frame("b", position=(1, 0, 0), mask_path="m/b.png"),
+        ]
+        capture = self.open(tmp_path / "c", frames)
+        assert capture.silhouettes == (tmp_path / "c" / "m" / "a.png",)
+        (note,) = [note for note in capture.notes if "mask_path" in note]
+        assert "1 of 1 cameras have several masks" in note
+        assert "b.png" in note
+        same = [f | {"mask_path": "m/a.png"} for f in frames]
+        assert not self.open(tmp_path / "d", same).notes
+
     def test_angle_instead_of_focal_length(self, tmp_path):
         # 90 degrees over 8 pixels: focal length 4
         folder = write_frames(tmp_path / "c", [frame()])

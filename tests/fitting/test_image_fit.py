@@ -47,6 +47,7 @@ def pixels_of(rng, model, n_pixels=N_PIXELS):
         entry=entry.ravel().astype(np.int32),
         share=rng.dirichlet(np.ones(3), n_pixels).ravel().astype(np.float32),
         values=np.zeros((n_pixels, N_LIGHTS, 3), np.float32),
+        at_least=np.zeros((n_pixels, N_LIGHTS, 3), np.bool_),
         views=unit(rng, n),
         lights=unit(rng, n, N_LIGHTS),
     )
@@ -136,6 +137,59 @@ def test_pixels_not_measured_and_unlit_do_not_count(small_rng):
     assert start.system.weight[5, 2, 1] == 0
     assert start.count == values.size - 3 * N_LIGHTS - 1
     assert np.isfinite(start.right).all()
+
+
+@pytest.mark.parametrize(("bound", "informs"), [(1.2, True), (0.8, False)])
+def test_saturated_pixels_count_only_where_the_model_is_darker(small_rng, bound, informs):
+    model = smooth_model(small_rng)
+    view = pixels_of(small_rng, model)
+    clipped = np.zeros(view.values.shape, np.bool_)
+    clipped[::2] = True
+    values = np.where(clipped, view.values * np.float32(bound), np.float32(np.nan))
+    known = replace(view, values=values)
+    bounds = replace(known, at_least=clipped)
+    as_bounds, as_values = (linearised(v, model, zeros(v, model)) for v in (bounds, known))
+    expected = as_values.system.weight if informs else np.zeros_like(values)
+    np.testing.assert_array_equal(as_bounds.system.weight, expected)
+    assert as_bounds.count == (clipped.sum() if informs else 0)
+    assert as_bounds.right.any() == informs
+
+
+def test_texels_that_are_saturated_wherever_they_are_seen_are_not_darker_than_that(small_rng):
+    model = smooth_model(small_rng)
+    begin = replace(model, diffuse=np.full_like(model.diffuse, 0.3))
+    bright = np.zeros(N_TEXELS, np.bool_)
+    bright[::5] = True
+    truth = replace(begin, diffuse=np.where(bright[:, None], np.float32(3), begin.diffuse))
+    views = [pixels_of(small_rng, truth) for _ in range(6)]
+    level = np.float32(1.5 * max(shown(begin, view).max() for view in views))
+
+    def darker_than_seen(as_bounds):
+        """Mean over clipped values of how much darker they are fitted than their limit."""
+        fitted, limits = [], []
+        for view in views:
+            of_bright = np.logical_or.reduceat(bright[view.entry], view.first[:-1])
+            clipped = of_bright[:, None, None] & (view.values >= level)
+            values = np.where(of_bright[:, None, None], np.float32(np.nan), view.values)
+            if as_bounds:
+                values[clipped] = level
+            fitted.append(replace(view, values=values, at_least=clipped & as_bounds))
+            limits.append(clipped)
+        found = begin
+        with ThreadPoolExecutor(2) as pool:
+            for _ in range(3):
+                normals = truth.frames[:, 2]
+                step = image_step(fitted, found, graph_of(N_TEXELS), normals, pool)
+                found = step.model
+        n_clipped = sum(clipped.sum() for clipped in limits)
+        assert step.n_bounds == (n_clipped if as_bounds else 0)
+        assert step.n_unmet < 0.5 * n_clipped
+        shades = [shown(found, v)[clipped] for v, clipped in zip(views, limits, strict=True)]
+        return np.maximum(1 - np.concatenate(shades) / level, 0).mean()
+
+    left_out, bounded = darker_than_seen(False), darker_than_seen(True)
+    assert left_out > 0.3
+    assert bounded < 0.1
 
 
 def test_steps_find_colours_and_normals_that_were_changed(small_rng):

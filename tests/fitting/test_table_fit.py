@@ -6,7 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reflfield.field.half_vector import DIFFUSE_NODES, LOBE_NODES, evaluate_half_vector
+from reflfield.field.half_vector import (
+    DIFFUSE_NODES,
+    LOBE_NODES,
+    N_DIFFERENCE,
+    evaluate_half_vector,
+    half_angles,
+)
 from reflfield.fitting import table_fit
 from reflfield.fitting.table_fit import TableRows, fit_tables, normalised_tables
 from tests.fitting.conftest import random_model, unit
@@ -28,6 +34,7 @@ def random_rows(rng, model, n_rows, per_row=3):
         views=unit(rng, n),
         lights=unit(rng, n),
         values=np.zeros((n_rows, 3), np.float32),
+        at_least=np.zeros((n_rows, 3), np.bool_),
     )
     return replace(rows, values=shown(model, rows))
 
@@ -106,6 +113,31 @@ def test_values_that_were_not_measured_do_not_count(small_rng):
     assert np.isfinite(found.lobes).all()
 
 
+def test_tables_reach_what_saturated_values_are_known_to_reach(small_rng):
+    """A highlight of ten degrees that no value shows but as white."""
+    model = random_model(small_rng, n=40, n_lobes=1)
+    model = replace(model, diffuse_table=np.ones_like(model.diffuse_table))
+    layer = np.exp(-((half_angles() / np.radians(10)) ** 2)).ravel()
+    peak = np.tile(layer, N_DIFFERENCE)[None, :, None].repeat(3, 2).astype(np.float32)
+    begin = replace(model, lobes=0.05 + 0 * peak, weights=np.ones_like(model.weights))
+    truth = replace(begin, lobes=np.float32(20) * peak + begin.lobes)
+    rows = random_rows(small_rng, truth, 4000, per_row=1)
+    level = np.float32(1.2 * shown(begin, rows).max())
+    clipped = rows.values >= level
+    dim = np.where(clipped, np.float32(np.nan), shown(begin, rows))
+    darker = {}
+    with ThreadPoolExecutor(2) as pool:
+        for bounds in (False, True):
+            values = np.where(clipped & bounds, level, dim)
+            found = begin
+            for _ in range(3):
+                some = replace(rows, values=values, at_least=clipped & bounds)
+                found = fit_tables(some, found, pool, smoothness=1e-4)
+            darker[bounds] = np.maximum(1 - shown(found, rows)[clipped] / level, 0).mean()
+    assert darker[False] > 0.2
+    assert darker[True] < 0.3 * darker[False]
+
+
 def test_the_normal_form_changes_no_sample(small_rng):
     model = random_model(small_rng)
     rows = random_rows(small_rng, model, 50)
@@ -121,7 +153,7 @@ def test_no_rows_leave_the_model_as_it_is(small_rng):
     rows = random_rows(small_rng, model, 4)
     none = TableRows(
         np.zeros(1, np.int64), rows.texel[:0], rows.share[:0], rows.views[:0],
-        rows.lights[:0], rows.values[:0],
+        rows.lights[:0], rows.values[:0], rows.at_least[:0],
     )  # fmt: skip
     assert fit_tables(none, model, ThreadPoolExecutor(1)) is model
 
@@ -140,6 +172,7 @@ def test_entries_of_one_row_are_corners_of_their_own(small_rng):
         views=np.repeat(together.views, 2, axis=0),
         lights=np.repeat(together.lights, 2, axis=0),
         values=together.values,
+        at_least=together.at_least,
     )
     with ThreadPoolExecutor(1) as pool:
         one, two = (system_of(model, r, pool).product(lobes, table) for r in (together, twice))

@@ -106,3 +106,43 @@ def test_unknown_lights_flat_surfaces_and_few_points_say_nothing(rng):
         Look(k.camera, k.light, k.points[:9], k.normals[:9], k.brightness[:9]) for k in looks
     ]
     assert other_light_axes(unknown) == other_light_axes(few) == ""
+
+
+def of_bowl(rng, *, n_wall, told=lambda lamp: lamp):
+    """Looks from above at a bowl that its hull closes with a shallow dome."""
+    looks = []
+    for i in range(12):
+        pose = looking_at((0.3, 0.2, 3), (0, 0, 0), (0, 1, 0))
+        camera = Camera(f"v{i}", "opencv", 8, 8, 8.0, 8.0, 4.0, 4.0, pose)
+        lamp = 4 * directions(rng, 1)[0]
+        lamp[2] = abs(lamp[2]) + 1
+        around, radius = rng.uniform(0, 2 * np.pi, 400), np.sqrt(rng.uniform(0, 0.9, 400))
+        x, y, height = radius * np.cos(around), radius * np.sin(around), np.sqrt(1 - radius**2)
+        hull = np.stack([x / 2, y / 2, np.ones(400)], axis=1)
+        hull /= np.linalg.norm(hull, axis=1, keepdims=True)
+        inside, lid = np.stack([-x, -y, height], axis=1), np.stack([x, y, 0 * x], axis=1)
+        around = rng.uniform(0, 2 * np.pi, n_wall)
+        wall = np.stack([np.cos(around), np.sin(around), 0 * around], axis=1)
+        points, normals = np.concatenate([lid, wall]), np.concatenate([inside, wall])
+        towards = lamp - points
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        brightness = np.maximum((towards * normals).sum(axis=1), 0)
+        light = Light(f"l{i}", "point", position=told(lamp))
+        looks.append(Look(camera, light, points, np.concatenate([hull, wall]), brightness))
+    return looks
+
+
+def test_a_bowl_whose_hull_is_closed_is_not_taken_for_lights_in_other_axes(rng):
+    looks = of_bowl(rng, n_wall=40)
+    assert agreement(looks, as_they_are) < 0.2  # as if it were lit from the other side
+    assert other_light_axes(looks) == ""
+
+
+def test_a_surface_that_faces_one_way_may_be_a_hollow(rng):
+    words = other_light_axes(of_bowl(rng, n_wall=0))
+    assert "turned by half about (0.0, 0.0, 1.0); either the object is hollow there" in words
+
+
+def test_lights_turned_by_half_are_no_hollow_where_the_surface_faces_sideways(rng):
+    looks = photographed(rng, lambda lamp, camera: lamp * [-1, -1, 1])
+    assert "read as (-x, -y, z)" in other_light_axes(looks)

@@ -17,6 +17,7 @@ from reflfield.observations.image_projection import (
     Projection,
     directions_of,
     facing_irradiance,
+    look_into,
     pairs_photographed,
     project_photographs,
     project_views,
@@ -349,3 +350,14 @@ def test_camera_that_images_nothing_is_named(capture_of, tmp_path):
     store.create_samples(projection.location, *projection.shape)
     with pytest.raises(InputError, match="pixels"):
         project_views(projection, range(1))
+
+
+def test_the_photographs_looked_into_show_every_light(capture_of, tmp_path):
+    """Every fourth of 10 x 6 photographs in their order would show four of the lights."""
+    capture = capture_of(np.ones((10, 6, HEIGHT, WIDTH, 3)), [lamp(f"l{i}") for i in range(6)])
+    points = np.zeros((1, 3))
+    seen = np.ones((1, 10), np.bool_)
+    found = look_into(Projection(capture, points, seen, tmp_path / "none"))
+    shown = [capture.photographs[i] for i in found.photograph]
+    assert {p.light for p in shown} == set(range(6))
+    assert len({p.camera for p in shown}) >= 6

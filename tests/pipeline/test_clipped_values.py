@@ -28,14 +28,14 @@ def capture():
     return Capture("vase", Path("/"), cameras, (Light("l0", "directional"),), ())
 
 
-def projected(**kinds):
+def projected(darkest=0.0, **kinds):
     """Values of two cameras by kind."""
     values = np.zeros((2, len(VALUE_KINDS)), np.int64)
     for kind, counts in kinds.items():
         values[:, VALUE_KINDS.index(kind)] = counts
     none = np.zeros(0, np.int64)
     nothing = LookedInto(none, none, np.zeros((0, 3), np.float32), np.zeros((0, 3), bool))
-    return Projected(2, values, np.ones((3, 1), bool), 1.0, nothing)
+    return Projected(2, values, np.ones((3, 1), bool), 1.0, darkest, nothing)
 
 
 def test_worst_camera_is_named_where_more_than_a_trace_is_saturated(capture):
@@ -48,6 +48,12 @@ def test_worst_camera_is_named_where_more_than_a_trace_is_saturated(capture):
 
 def test_a_trace_is_not_told(capture):
     assert not list(clipping_lines(capture, projected(measured=[9_999, 0], saturated=[5, 0])))
+
+
+def test_negative_values_are_told_but_not_noise_about_black(capture):
+    assert not list(clipping_lines(capture, projected(darkest=-0.05, measured=[9, 9])))
+    (line,) = clipping_lines(capture, projected(darkest=-0.8, measured=[9, 9]))
+    assert "values on the object are negative, down to -80% of the brightest" in line
 
 
 @pytest.mark.parametrize("kind", ["saturated", "transparent", "dark"])
