@@ -84,7 +84,8 @@ def test_samples_are_those_of_the_nearest_over_its_light(nearest, sphere):
     expected = cosine[inner, None] * ALBEDO / np.pi
     # Texels and pixels are 6 and 3 degrees wide: cosines differ by .07 from one to the next.
     assert carried.samples[inner] == pytest.approx(expected, abs=0.07 * ALBEDO.max() / np.pi)
-    assert carried.share_filled < 0.02
+    # The rim, where texels of the poles crowd: within 1.5 of its 19 pixels none is sampled.
+    assert 0 < carried.share_filled < 0.5
 
 
 def test_what_the_nearest_does_not_see_comes_from_the_next(nearest):
