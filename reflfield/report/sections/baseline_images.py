@@ -104,6 +104,8 @@ def analysis_sections(sets: Iterable[AnalysedImages]) -> tuple[Section, Section]
     where: list[Item] = []
     for images in sets:
         beside += [baselines_table(images), *_notes(images.baselines)]
+        if not where:
+            where.append(_definitions(images.kinds["definitions"]))
         where.append(kinds_table(images))
         for number, image in enumerate(images.shown):
             if number == 0:  # one is enough to see what the baselines are
@@ -213,12 +215,16 @@ def kinds_table(images: AnalysedImages) -> Table:
         )
         for name, kind in images.kinds["kinds"].items()
     ]
-    explained = "; ".join(f"{k}: {images.kinds['definitions'][k]}" for k in KINDS)
     return Table(
         ("kind", "pixels", "squared error", "PSNR LDR, dB"),
         tuple(rows),
-        f"{images.title}. A pixel is of the first kind that applies: {explained}.",
+        f"{images.title}: of {len(images.comparison.frames)} photographs together.",
     )
+
+
+def _definitions(definitions: Mapping[str, str]) -> Note:
+    explained = "; ".join(f"{kind}: {definitions[kind]}" for kind in KINDS)
+    return Note(f"A pixel is of the first kind that applies. {explained[0].upper()}{explained[1:]}.")
 
 
 def _kinds_figure(images: AnalysedImages, image: AnalysedImage) -> Figure:
