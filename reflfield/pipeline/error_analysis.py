@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from reflfield.capture.image_writing import write_exr
 from reflfield.field.file import open_field
-from reflfield.field.texture_field import filled_from_nearest
 from reflfield.metrics import error_kinds
 from reflfield.metrics.baselines import BLACK, MEAN, Baselines, BaselineScores, albedo_of_means
 from reflfield.metrics.error_kinds import KindErrors, KindFinder, errors_by_kind
@@ -26,7 +25,7 @@ from reflfield.pipeline.hold_out import held_out_counts
 from reflfield.pipeline.maps import AVERAGES
 from reflfield.pipeline.memory import within_memory
 from reflfield.render.camera_rays import FieldSurface
-from reflfield.render.nearest_photographs import NearestPhotographs
+from reflfield.render.nearest_photographs import NearestPhotographs, filled_from_nearest
 from reflfield.sphere.hemisphere import softened_cosine
 from reflfield.util.progress import track
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT, UNKNOWN, Light
 from reflfield.errors import InputError
-from reflfield.field.texture_field import filled_from_nearest
 from reflfield.geometry.occlusion import VisibilityOptions, view_visibility
 from reflfield.observations.image_projection import VALUE_KINDS, samples_of_photograph
 from reflfield.render.camera_rays import FieldSurface
@@ -213,3 +213,49 @@ def angles_between(directions: Array, direction: Array) -> Array:
     """
     across = np.linalg.norm(np.cross(directions, direction), axis=1)
     return np.asarray(np.arctan2(across, directions @ direction))
+
+
+def filled_from_nearest(
+    values: NDArray[np.floating], positions: NDArray[np.floating], reach: float = np.inf
+) -> NDArray[np.floating]:
+    """Values of points, NaN replaced by the value of the nearest point that has one.
+
+    Parameters
+    ----------
+    values : (n, k) float
+        Each column is filled by itself.
+    positions : (n, 3) float
+    reach : float
+        Points without a value that are farther than this from all that have one become 0.
+
+    Returns
+    -------
+    (n, k) float
+
+    Raises
+    ------
+    InputError
+        If a column is NaN everywhere.
+
+    Examples
+    --------
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0], [9, 0, 0]])
+    >>> values = np.array([[1.0], [np.nan], [3.0], [np.nan]])
+    >>> filled_from_nearest(values, points).ravel()
+    array([1., 1., 3., 3.])
+    >>> filled_from_nearest(values, points, reach=2.0).ravel()
+    array([1., 1., 3., 0.])
+    """
+    filled, unknown = np.nan_to_num(values, nan=0.0), np.isnan(values)
+    if unknown.all(axis=0).any():
+        raise InputError("values: expected at least one that is known, received none")
+    nearest = np.zeros(0, np.intp)
+    for k, missing in enumerate(unknown.T):
+        if missing.any():
+            # Most points lack all columns or none: one search does for all.
+            if k == 0 or not np.array_equal(missing, unknown[:, k - 1]):
+                tree = cKDTree(positions[~missing])
+                nearest = tree.query(positions[missing], distance_upper_bound=reach)[1]
+            known = np.append(values[~missing, k], 0.0)  # the last where none is near
+            filled[missing, k] = known[nearest]
+    return filled

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from reflfield.errors import InputError, ShapeError
+from reflfield.errors import ShapeError
 from reflfield.field.evaluation import evaluate, sum_lights
 from reflfield.field.texture_field import (
     apparent_texture,
-    filled_from_nearest,
     lambertian_texture,
 )
 from reflfield.sphere.hemisphere import softened_cosine
@@ -63,15 +62,3 @@ def test_apparent_samples_depend_on_no_direction(sphere, rng):
 def test_one_colour_for_each_texel_is_demanded(sphere):
     with pytest.raises(ShapeError, match="samples"):
         apparent_texture(sphere, np.ones((3, 3)))
-
-
-def test_columns_are_filled_by_themselves(rng):
-    positions = np.arange(5.0)[:, None] * [1, 0, 0]
-    values = np.array([[1, np.nan], [np.nan, np.nan], [3, 7], [4, np.nan], [np.nan, 8.0]])
-    filled = filled_from_nearest(values, positions)
-    assert filled[:, 0].tolist()[2:] == [3, 4, 4]
-    assert filled[1, 0] in (1, 3)
-    assert filled[:, 1].tolist()[:3] == [7, 7, 7]
-    assert np.isnan(values[1, 0])  # what was given stays
-    with pytest.raises(InputError, match="values"):
-        filled_from_nearest(np.full((2, 1), np.nan), positions[:2])

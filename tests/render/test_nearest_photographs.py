@@ -9,7 +9,7 @@ from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import DirectionalLight, Light
 from reflfield.errors import InputError
 from reflfield.render.camera_rays import FieldSurface
-from reflfield.render.nearest_photographs import NearestPhotographs
+from reflfield.render.nearest_photographs import NearestPhotographs, filled_from_nearest
 from reflfield.render.renderer import RenderOptions, render
 from tests.synthetic_fields import baked_field, lambert, sphere_surface
 
@@ -112,3 +112,15 @@ def test_an_environment_has_no_nearest(nearest, tmp_path):
     sky = Light("sky", "environment", file=tmp_path / "sky.exr")
     with pytest.raises(InputError, match="light 'sky'"):
         nearest.carried(camera(0), sky)
+
+
+def test_columns_are_filled_by_themselves(rng):
+    positions = np.arange(5.0)[:, None] * [1, 0, 0]
+    values = np.array([[1, np.nan], [np.nan, np.nan], [3, 7], [4, np.nan], [np.nan, 8.0]])
+    filled = filled_from_nearest(values, positions)
+    assert filled[:, 0].tolist()[2:] == [3, 4, 4]
+    assert filled[1, 0] in (1, 3)
+    assert filled[:, 1].tolist()[:3] == [7, 7, 7]
+    assert np.isnan(values[1, 0])  # what was given stays
+    with pytest.raises(InputError, match="values"):
+        filled_from_nearest(np.full((2, 1), np.nan), positions[:2])

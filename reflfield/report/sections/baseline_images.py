@@ -224,7 +224,7 @@ def kinds_table(images: AnalysedImages) -> Table:
 
 def _definitions(definitions: Mapping[str, str]) -> Note:
     explained = "; ".join(f"{kind}: {definitions[kind]}" for kind in KINDS)
-    return Note(f"A pixel is of the first kind that applies. {explained[0].upper()}{explained[1:]}.")
+    return Note(f"A pixel is of the first kind of these that applies: {explained}.")
 
 
 def _kinds_figure(images: AnalysedImages, image: AnalysedImage) -> Figure:
