@@ -230,7 +230,9 @@ class KindFinder:
             near = VisibilityOptions(edge_band=EDGE_PX)
             self._edges = camera, depth_edges(self._surface.scene, camera, near)
         covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
-        return np.asarray(self._edges[1] | ~binary_erosion(covered, _disk(EDGE_PX + 0.5)))
+        # The object may go on beyond the border of the image, which is no outline.
+        inner = binary_erosion(covered, _disk(EDGE_PX + 0.5), border_value=1)
+        return np.asarray(self._edges[1] | ~inner)
 
     def _light_on(
         self, hits: SurfaceHits, normals: Floats, light: Light

@@ -170,6 +170,18 @@ def test_what_is_seen_under_a_small_cosine_is_grazing(floor):
     assert (kinds[seen] == GRAZING).all()
 
 
+def test_the_border_of_the_image_is_no_outline(floor):
+    """The floor fills a smaller image: only the strip above it has an outline."""
+    small, shape = overhead(40), (40, 40)
+    flat = np.full((*shape, 3), 0.2)
+    pair = ImagePair("a", flat, flat, np.ones(shape))
+    finder = KindFinder(floor, np.ones((floor.field.n_texels, 3)))
+    kinds = finder.kinds(pair, small, Light("l", "unknown"), flat, 1.0)
+    # The strip begins at x = .4, which is column 40; nearer than 4 to it are the last ones.
+    assert (kinds[2:-2, 2:35] == REST).all()
+    assert (kinds[:2] == NO_KIND).all()
+
+
 def test_saturated_pixels_have_no_kind(floor):
     excluded = np.zeros((SIZE, SIZE), bool)
     excluded[50:60, 50:60] = True
