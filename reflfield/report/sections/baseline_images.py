@@ -190,7 +190,7 @@ def _baselines_figure(images: AnalysedImages, image: AnalysedImage) -> Figure:
             f"{text}, {psnrs[baseline]:.2f} dB",
         )
         for baseline, text in BASELINE_NAMES.items()
-        if baseline in image.baselines
+        if baseline in image.baselines and baseline in psnrs
     ]
     return Figure(
         tuple(panels),
