@@ -194,12 +194,16 @@ class Moment(NamedTuple):
     wait: float
 
 
+# Stages that are short, and no block of which can be waited for.
+WITHOUT_BLOCKS = ("comparison", "error_analysis", "report")
+
+
 def moments(stages: list[dict[str, Any]], n: int, rng: random.Random) -> list[Moment]:
     """Random moments, in order, each stage as probable as it is long.
 
     They are told by what is finished, not by the clock, so that none comes too late.
     """
-    stages = [stage for stage in stages if stage["name"] not in ("comparison", "report")]
+    stages = [stage for stage in stages if stage["name"] not in WITHOUT_BLOCKS]
     drawn = rng.choices(range(len(stages)), [stage["seconds"] for stage in stages], k=n)
     found = []
     for i, share in sorted((i, rng.random()) for i in drawn):

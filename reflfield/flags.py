@@ -24,6 +24,7 @@ FLAGS = {
     "test_split": "--hold-out test",
     "encoding": "--encoding",
     "layer": "--layer",
+    "field_photographs": "--photographs",
     "size": "--size",
     "psnr": "--psnr",
     "n_frames": "--orbit",

@@ -67,6 +67,7 @@ def compare(
     capture: Capture,
     out: Path | str,
     *,
+    field_photographs: Capture | None = None,
     options: RenderOptions | None = None,
     resources: Resources | None = None,
 ) -> dict[str, Any]:
@@ -80,13 +81,17 @@ def compare(
     out : Path or str
         Folder; gets the images, ``metrics.json`` and ``report/index.html``: all, or nothing
         after an error.
+    field_photographs : Capture, optional
+        Photographs that made the field, of which the nearest one in view and light is a
+        baseline. Not needed where `capture` has them itself.
     options : RenderOptions, optional
     resources : Resources, optional
 
     Returns
     -------
     dict
-        Content of ``metrics.json``: ``mean`` over the photographs, and each of them.
+        Content of ``metrics.json``: ``mean`` over the photographs, each of them, what
+        trivial ``baselines`` get, and ``error_kinds``: where the error lies.
 
     Raises
     ------
@@ -96,7 +101,7 @@ def compare(
     """
     limits = options or RenderOptions(), resources or Resources()
     fitting = check_frames_memory(field.stored, capture, *limits, compared=True)
-    return write_comparison_with(field.stored, capture, Path(out), fitting).to_dict()
+    return write_comparison_with(field.stored, capture, Path(out), fitting, field_photographs)
 
 
 def render_turntable(

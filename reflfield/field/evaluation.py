@@ -23,6 +23,7 @@ from reflfield.field.reflectance_field import (
     HalfVectorField,
     ReflectanceField,
 )
+from reflfield.field.texture_field import TextureField
 from reflfield.sphere.hemisphere import first_tap, softened_cosine_of, square_from_xyz
 from reflfield.util.validation import UNIT_TOLERANCE, check_shape
 
@@ -206,6 +207,10 @@ def evaluate(
     if isinstance(field, HalfVectorField):
         evaluate_half_vector(*field.half_vector.arrays, index, views, lights, out)
         return out
+    if isinstance(field, TextureField):
+        np.multiply(field.colours[index], field.cosines(index, lights)[:, None], out=out)
+        out[index < 0] = 0.0
+        return out
     field = clustered(field)
     _evaluate(
         field.node_table,
@@ -356,6 +361,12 @@ def _add_direct_light(
     """Add what texels send back of lights: directions, irradiances, which reach them."""
     if isinstance(field, HalfVectorField):
         sum_half_vector_lights(*field.half_vector.arrays, index, views, *lights, out)
+        return
+    if isinstance(field, TextureField):
+        directions, powers, reached = lights
+        each = np.broadcast_to(directions, (len(index), *directions.shape))
+        out += field.colours[index] * ((field.cosines(index, each) * reached) @ powers)
+        out[index < 0] = 0.0
         return
     field = clustered(field)
     _sum_lights(

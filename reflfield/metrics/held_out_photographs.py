@@ -41,17 +41,22 @@ class RelitPairs:
         return len(self.frames.photographs)
 
     def __iter__(self) -> Iterator[ImagePair]:
-        for i, photograph in enumerate(self.frames.photographs):
-            radiance, kinds = self.frames.read_kinds(i)
-            yield ImagePair(
-                name=photograph.name,
-                photograph=radiance,
-                relit=read_image(self.folder / f"{photograph.name}.exr"),
-                silhouette=self.silhouettes.read(photograph.camera),
-                # What is too dark to measure is as good as black; what is too bright is not.
-                excluded=np.any((kinds != MEASURED) & (radiance > 0), axis=-1),
-                silhouette_from=self.silhouettes.origins[photograph.camera],
-            )
+        for i in range(len(self)):
+            yield self.read(i)
+
+    def read(self, index: int) -> ImagePair:
+        """Photograph `index` with the image rendered for it."""
+        photograph = self.frames.photographs[index]
+        radiance, kinds = self.frames.read_kinds(index)
+        return ImagePair(
+            name=photograph.name,
+            photograph=radiance,
+            relit=read_image(self.folder / f"{photograph.name}.exr"),
+            silhouette=self.silhouettes.read(photograph.camera),
+            # What is too dark to measure is as good as black; what is too bright is not.
+            excluded=np.any((kinds != MEASURED) & (radiance > 0), axis=-1),
+            silhouette_from=self.silhouettes.origins[photograph.camera],
+        )
 
     def measured_in(self, comparison: Comparison) -> RelitPairs:
         """Those photographs alone that a comparison of them has measured."""

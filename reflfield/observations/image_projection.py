@@ -332,15 +332,39 @@ def look_into(projection: Projection) -> LookedInto:
     chosen = np.sort(np.array(order)[places])
     columns = []
     for index in chosen:
-        photograph = capture.photographs[index]
-        seen = np.flatnonzero(projection.visible[:, photograph.camera])
+        seen = np.flatnonzero(projection.visible[:, capture.photographs[index].camera])
         some = seen[:: max(1, len(seen) // TEXELS_FOR_UNIT)]
-        points = np.asarray(projection.positions[some], np.float64)
-        pixels, _ = capture.cameras[photograph.camera].project(points)
-        lights = np.array([photograph.light])
-        values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
-        columns.append((np.full(len(some), index), some, values[:, 0], kinds[:, 0] == 0))
+        values, kinds = samples_of_photograph(capture, int(index), projection.positions[some])
+        columns.append((np.full(len(some), index), some, values, kinds == 0))
     return LookedInto(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def samples_of_photograph(
+    capture: Capture, index: int, positions: NDArray[np.floating]
+) -> tuple[Floats, Kinds]:
+    """Samples of one photograph at points that its camera sees.
+
+    Parameters
+    ----------
+    capture : Capture
+    index : int
+        Of the photograph.
+    positions : (n, 3) float
+        Metres, world frame.
+
+    Returns
+    -------
+    values : (n, 3) float32
+        Radiance over the light's irradiance; NaN where nothing is known of it.
+    kinds : (n, 3) uint8
+        Places in `VALUE_KINDS`.
+    """
+    photograph = capture.photographs[index]
+    points = np.asarray(positions, np.float64)
+    pixels, _ = capture.cameras[photograph.camera].project(points)
+    lights = np.array([photograph.light])
+    values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
+    return values[:, 0], kinds[:, 0]
 
 
 def sample_unit(looked_into: LookedInto) -> float:

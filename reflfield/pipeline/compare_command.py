@@ -4,23 +4,39 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from reflfield.capture.capture import Capture
+from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.mesh import Mesh
+from reflfield.metrics.baselines import Baselines, albedo_of_field
 from reflfield.metrics.comparison_silhouettes import write_comparison_silhouettes
+from reflfield.metrics.error_kinds import KindFinder
 from reflfield.metrics.held_out_photographs import RelitPairs, compare_with_photographs
-from reflfield.metrics.image_metrics import Comparison, metrics_text
+from reflfield.metrics.image_metrics import metrics_text
+from reflfield.pipeline.analysis_report import analysed_images
+from reflfield.pipeline.error_analysis import Analyser, analyse, metrics_of
 from reflfield.pipeline.relight_command import check_kept, image_files
+from reflfield.render.camera_rays import FieldSurface
+from reflfield.render.nearest_photographs import NearestPhotographs
 from reflfield.render.renderer import RenderOptions
 from reflfield.report import sections
 from reflfield.report.page import ReportContent, write_report
+from reflfield.report.sections import AnalysedImages
 from reflfield.util.files import filling
+
+# Title of the set of photographs.
+TITLE = "Frames"
 
 
 def write_comparison_with(
-    field: ReflectanceField, frames: Capture, out: Path, options: RenderOptions
-) -> Comparison:
+    field: ReflectanceField,
+    frames: Capture,
+    out: Path,
+    options: RenderOptions,
+    photographs: Capture | None = None,
+) -> dict[str, Any]:
     """Relight frames, measure them, and write images, ``metrics.json`` and a page.
 
     Parameters
@@ -33,10 +49,14 @@ def write_comparison_with(
         Gets ``relit/``, ``metrics.json`` and ``report/index.html``: all, or nothing after an
         error.
     options : RenderOptions
+    photographs : Capture, optional
+        That made the field, for the nearest one of each frame; `frames` where they are of the
+        field's own capture.
 
     Returns
     -------
-    Comparison
+    dict
+        `Comparison.to_dict`, with the baselines and the errors by kind.
 
     Raises
     ------
@@ -55,22 +75,77 @@ def write_comparison_with(
             field, frames, silhouettes, partial / "relit", options
         )
         pairs = RelitPairs(frames, partial / "relit", silhouettes).measured_in(comparison)
-        (partial / "metrics.json").write_text(metrics_text(comparison.to_dict()))
-        write_report(partial / "report" / "index.html", _page(field, comparison, pairs))
-    return comparison
+        analyser = _analyser(field, frames, photographs, options)
+        analysed = analyse(analyser, pairs, comparison, Path(scratch))
+        found = metrics_of(analysed)
+        (partial / "metrics.json").write_text(metrics_text(comparison.to_dict(), **found))
+        images = analysed_images(TITLE, comparison, analysed, pairs, Path(scratch))
+        write_report(partial / "report" / "index.html", _page(field, pairs, images))
+    return {**comparison.to_dict(), **found}
 
 
-def _page(field: ReflectanceField, comparison: Comparison, pairs: RelitPairs) -> ReportContent:
+def _analyser(
+    field: ReflectanceField,
+    frames: Capture,
+    photographs: Capture | None,
+    options: RenderOptions,
+) -> Analyser:
+    """Baselines of a field without its run: the mean texture is the field's own."""
+    surface = FieldSurface(field, options.workers, options.ray_offset)
+    albedo = albedo_of_field(field, surface)
+    nearest = _nearest(field, surface, frames, photographs)
+    return Analyser(
+        Baselines(field, surface, albedo, nearest, options), KindFinder(surface, albedo)
+    )
+
+
+def _nearest(
+    field: ReflectanceField, surface: FieldSurface, frames: Capture, photographs: Capture | None
+) -> NearestPhotographs | str:
+    """Photographs that made the field, or why there are none."""
+    if photographs is None and not is_capture_of(field, frames):
+        return (
+            "the photographs that made the field are not at hand; name their capture with "
+            "`field_photographs`"
+        )
+    try:
+        return NearestPhotographs(surface, photographs or frames)
+    except InputError as error:
+        return str(error)
+
+
+def is_capture_of(field: ReflectanceField, capture: Capture) -> bool:
+    """Whether a capture has the name of the one that made a field, and views and lights enough.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    capture : Capture
+
+    Returns
+    -------
+    bool
+    """
+    views, lights = (field.metadata.get(name) for name in ("views", "lights"))
+    return bool(
+        field.metadata.get("capture") == capture.name
+        and (isinstance(views, int) and capture.n_views >= views)
+        and (isinstance(lights, int) and capture.n_lights >= lights)
+    )
+
+
+def _page(field: ReflectanceField, pairs: RelitPairs, images: AnalysedImages) -> ReportContent:
     return ReportContent(
         title=f"{field.metadata.get('capture', 'field')} against {pairs.frames.name}",
         subtitle=f"{len(pairs)} frames",
-        key_numbers=sections.key_numbers(comparison),
+        key_numbers=sections.key_numbers(images.comparison),
         sections=(
             sections.held_out_section(
-                comparison,
+                images.comparison,
                 pairs,
-                title="Frames",
+                title=TITLE,
                 intro="Photographs beside what the field predicts for them.",
             ),
+            *sections.analysis_sections([images]),
         ),
     )

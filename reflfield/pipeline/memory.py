@@ -26,9 +26,9 @@ BASE_BYTES = 512 << 20
 # A pixel of a photograph while it is read: as stored, as float32, what of it was measured, and
 # the copy that is sampled or shown.
 PHOTOGRAPH_BYTES = 48
-# A pixel of a held-out photograph while it is compared and shown in the report; and of the
-# strip that is measured, besides.
-HELD_OUT_BYTES, STRIP_BYTES = 46, 500
+# A pixel of a held-out photograph while it is compared, with a baseline's image beside the
+# field's, and shown in the report; and of the strip that is measured, besides.
+HELD_OUT_BYTES, STRIP_BYTES = 62, 500
 # What compiling the kernels of a first run leaves in memory, before photographs are compared.
 COMPILED_BYTES = 400 << 20
 # A pixel of a silhouette while it is made from photographs.
@@ -160,6 +160,8 @@ FRAME_BYTES = 13
 MAP_BYTES = 28
 # Texel of a field that is rendered, besides its components: frame, point, normal, owner.
 RENDERED_TEXEL_BYTES = 160
+# Of a field that is compared: point, frame and triangle of the texel, what the baselines show.
+BASELINE_TEXEL_BYTES = 300
 
 
 def field_bytes(field: ReflectanceField, n_directions: int) -> int:
@@ -175,6 +177,7 @@ def check_image_memory(
     *,
     pixels: int,
     pixel_bytes: int = IMAGE_BYTES,
+    texel_bytes: int = 0,
     kept_pixels: int = 0,
     map_pixels: int = 0,
 ) -> RenderOptions:
@@ -189,6 +192,8 @@ def check_image_memory(
         Of the largest image.
     pixel_bytes : int
         Memory of one of them.
+    texel_bytes : int
+        Of each texel, besides what rendering takes.
     kept_pixels : int
         Of all frames of a turntable.
     map_pixels : int
@@ -209,7 +214,7 @@ def check_image_memory(
     images = pixels * pixel_bytes + kept_pixels * FRAME_BYTES
     directions = options.environment_directions if map_pixels else 0
     least = BASE_BYTES + field_bytes(field, directions) + map_pixels * MAP_BYTES
-    least += blocks + images
+    least += blocks + images + texel_bytes * field.n_texels
     if least > resources.max_memory:
         frames = f" and {kept_pixels} in all" if kept_pixels else ""
         received = gigabytes(resources.max_memory)
@@ -238,6 +243,7 @@ def check_frames_memory(
         options,
         pixels=max((c.width * c.height for c in frames.cameras), default=0),
         pixel_bytes=IMAGE_BYTES + compared * COMPARED_BYTES,
+        texel_bytes=compared * BASELINE_TEXEL_BYTES,
         map_pixels=max((width * height for width, height in sizes), default=0),
     )
 

@@ -33,6 +33,8 @@ RESULTS = {
     "surface": {"surface.ply": "surface.ply"},
     "maps": {name: name for name in ("atlas.glb", "normals.exr", "tangents.exr")},
     "comparison": {"metrics.json": "metrics.json"},
+    # The same with the baselines and the errors by kind.
+    "error_analysis": {"metrics.json": "metrics.json"},
     "report": {"index.html": "report/index.html"},
 }
 TIMINGS, OPTIONS = "timings.json", "options.toml"
@@ -75,13 +77,21 @@ def publish(context: Context) -> None:
 
 
 def _results(context: Context) -> Iterator[tuple[str, Path, Mapping[str, Any]]]:
-    """Name, file and checksum of every result of the stages that have run."""
+    """Name, file and checksum of every result of the stages that have run.
+
+    Of stages with a result of the same name, that of the last which has run or follows.
+    """
+    found: dict[str, tuple[Path, Mapping[str, Any]]] = {}
     for stage, files in RESULTS.items():
-        if context.stages.record(stage) is not None:
+        for source, target in files.items():
+            if context.stages.record(stage) is None and not (
+                target in found and key_that_follows(context.stages, stage) is not None
+            ):
+                continue
             folder = context.stages.root / stage
-            recorded = read_record(folder)["checksums"]["files"]
-            for source, target in files.items():
-                yield target, folder / source, recorded[source]
+            found[target] = folder / source, read_record(folder)["checksums"]["files"][source]
+    for target, (path, recorded) in found.items():
+        yield target, path, recorded
 
 
 def _check_copy(context: Context, copy: Path, source: Path) -> None:
@@ -95,17 +105,25 @@ def _check_copy(context: Context, copy: Path, source: Path) -> None:
 
 def _outdated(context: Context) -> Iterator[str]:
     """Results in the output folder that do not follow from the stages that have run."""
-    for stage, files in RESULTS.items():
-        if context.stages.record(stage) is not None:
-            continue
-        recorded = read_record(context.stages.root / stage)
-        current = key_that_follows(context.stages, stage) is not None
-        for source, target in files.items():
-            path = context.out / target
-            if path.is_file() and not (
-                current and agrees(path, recorded["checksums"]["files"].get(source, {}))
-            ):
-                yield target
+    for target in dict.fromkeys(target for f in RESULTS.values() for target in f.values()):
+        path = context.out / target
+        if path.is_file() and not any(
+            _is_current(context, stage, source, path)
+            for stage, files in RESULTS.items()
+            for source, name in files.items()
+            if name == target
+        ):
+            yield target
+
+
+def _is_current(context: Context, stage: str, source: str, path: Path) -> bool:
+    """Whether a file is of a stage that has run, or what it would leave there again."""
+    if context.stages.record(stage) is not None:
+        return True
+    if key_that_follows(context.stages, stage) is None:
+        return False
+    recorded = read_record(context.stages.root / stage)["checksums"]["files"]
+    return agrees(path, recorded.get(source, {}))
 
 
 def key_that_follows(stages: StageFolder, name: str) -> str | None:
@@ -171,12 +189,12 @@ def publish_records(context: Context, last: str, *, whole: bool) -> None:
 
 def published(context: Context) -> list[Path]:
     """Results of this run in the output folder; none that an earlier run has left there."""
-    names = [
+    names = dict.fromkeys(
         target
         for stage, files in RESULTS.items()
         if context.stages.record(stage) is not None
         for target in files.values()
-    ]
+    )
     return [context.out / name for name in (*names, TIMINGS)]
 
 

@@ -16,7 +16,8 @@ from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.metrics.held_out_photographs import RelitPairs
 from reflfield.metrics.image_metrics import Comparison
-from reflfield.pipeline import comparison, hold_out, model_selection, results
+from reflfield.pipeline import comparison, error_analysis, hold_out, model_selection, results
+from reflfield.pipeline.analysis_report import analysed_images
 from reflfield.pipeline.atlas import METHOD
 from reflfield.pipeline.cache import plain, versions
 from reflfield.pipeline.compared_photographs import compared_photographs
@@ -67,6 +68,7 @@ def report_content(
     main = compared.get("heldout") or compared.get("truth")
     parts = [
         *_frames_sections(context, compared),
+        *_analysis_sections(context, compared),
         *_selection_sections(context),
         *_ablation_sections(context, compared),
         *_rate_sections(context),
@@ -199,6 +201,19 @@ def _frames_sections(
         if measured is not None:
             title, intro = FRAME_TITLES[name]
             yield sections.held_out_section(measured, pairs, title=title, intro=intro)
+
+
+def _analysis_sections(
+    context: Context, compared: dict[str, Comparison | None]
+) -> tuple[Section, ...]:
+    """Trivial baselines, and where the error lies, if anything was compared."""
+    folder, sets = context.stages.root / error_analysis.STAGE, []
+    for name, pairs in comparison.relit_pairs(context).items():
+        measured, analysed = compared[name], error_analysis.analysis_of(context, name)
+        if measured is not None and analysed is not None:
+            title = FRAME_TITLES[name][0]
+            sets.append(analysed_images(title, measured, analysed, pairs, folder / name))
+    return sections.analysis_sections(sets) if sets else ()
 
 
 def _ablation_sections(

@@ -58,6 +58,11 @@ def comparison_digests(context: Context) -> dict[str, str]:
     return {**compared_digests(context), "held_out": counts}
 
 
+def error_analysis_digests(context: Context) -> dict[str, str]:
+    """What the baselines are made of: the photographs of the field, and those compared."""
+    return {**comparison_digests(context), **photographs_digest(context)}
+
+
 def truth_digest(context: Context) -> dict[str, str]:
     """Digest of all files of the truth that a simulated capture brings."""
     total, files = hashlib.sha256(), sorted((context.capture.root / TRUTH).rglob("*"))

@@ -24,6 +24,7 @@ from reflfield.pipeline import (
     comparison,
     completion,
     compression,
+    error_analysis,
     held_out_silhouettes,
     hull,
     indirect,
@@ -227,6 +228,14 @@ COMPARISON = Stage(
     options=stage_inputs.rendering_options,
     reads=stage_inputs.comparison_digests,
 )
+# trivial baselines beside the field; errors by kind of pixel
+ERROR_ANALYSIS = Stage(
+    error_analysis.STAGE,
+    error_analysis.write_error_analysis,
+    after=(MAPS, COMPARISON),
+    options=stage_inputs.rendering_options,
+    reads=stage_inputs.error_analysis_digests,
+)
 # quality against size: the models quantised more and more coarsely
 RATE_DISTORTION = Stage(
     "rate_distortion",
@@ -240,7 +249,7 @@ RATE_DISTORTION = Stage(
 REPORT = Stage(
     "report",
     report.write_report_page,
-    after=(MODEL_SELECTION, MAPS, COMPARISON, RATE_DISTORTION),
+    after=(MODEL_SELECTION, MAPS, COMPARISON, ERROR_ANALYSIS, RATE_DISTORTION),
     options=stage_inputs.report_options,
     reads=stage_inputs.report_digests,
 )
@@ -265,6 +274,7 @@ ORDER = (
     MAPS,
     WITHOUT_ALIGNMENT,
     COMPARISON,
+    ERROR_ANALYSIS,
     RATE_DISTORTION,
     REPORT,
 )

@@ -17,7 +17,7 @@ from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.occlusion import VisibilityOptions
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.geometry.texels import texel_table
+from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.geometry.uv_atlas import Atlas
 
 Array = NDArray[np.float64]
@@ -218,8 +218,8 @@ class FieldSurface:
         return reached
 
     @cached_property
-    def texel_points(self) -> tuple[Array, Array]:
-        """Positions and triangle normals of all texels, (n_texels, 3) each."""
+    def texels(self) -> TexelTable:
+        """Texels of the field, in its order, as the mesh and its texture coordinates say."""
         field = self.field
         height, width = field.texel_of_pixel.shape
         atlas = Atlas(
@@ -232,11 +232,12 @@ class FieldSurface:
             width=width,
         )
         table = texel_table(atlas)
-        nearest = _nearest_rows(field, table.pixel)
-        return (
-            table.position[nearest],
-            table.face_normal[nearest].astype(np.float64),
-        )
+        return table.subset(_nearest_rows(field, table.pixel))
+
+    @cached_property
+    def texel_points(self) -> tuple[Array, Array]:
+        """Positions and triangle normals of all texels, (n_texels, 3) each."""
+        return self.texels.position, self.texels.face_normal.astype(np.float64)
 
 
 def pixel_window(camera: Camera, mesh: Mesh) -> tuple[int, int, int, int]:

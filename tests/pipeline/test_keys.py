@@ -31,7 +31,9 @@ OPTIONS = with_tables(
     },
 )
 FIELD = ("indirect", "completion", "alignment", "resampling", "compression")
-LATER = ("maps", "without_alignment", "comparison", "rate_distortion", "report")
+# What depends on the images of the fields.
+IMAGES = ("comparison", "error_analysis", "rate_distortion", "report")
+LATER = ("maps", "without_alignment", *IMAGES)
 REFLECTANCE = ("observations", *FIELD, *LATER)
 AFTER_HULL = ("atlas", "visibility", "held_out_silhouettes", *REFLECTANCE)
 
@@ -143,7 +145,7 @@ INPUTS = {
     "a photograph": (bits(photograph("training")), {*REFLECTANCE}),
     "a held-out photograph": (
         bits(photograph("frames")),
-        {"comparison", "rate_distortion", "report"},
+        {*IMAGES},
     ),
     "the capture's name": (
         described(lambda d: d.update(name="another")),
@@ -183,12 +185,12 @@ TABLES = {
     "compression": AFTER_COMPRESSION,
     "compression.rank": {"resampling", *AFTER_COMPRESSION},
     "compression.training_texels": {"resampling", *AFTER_COMPRESSION},
-    "relighting": {"comparison", "rate_distortion", "report"},
+    "relighting": {*IMAGES},
     "relighting.workers": set(),
     "relighting.block_pixels": set(),
     # A field to compare with more or less; the report lists what was asked for.
     "comparison.without_alignment": {
-        *("without_alignment", "comparison", "rate_distortion", "report"),
+        *("without_alignment", *IMAGES),
     },
     "comparison.rate_distortion": {"rate_distortion", "report"},
     "seed": {*FIELD, *LATER},

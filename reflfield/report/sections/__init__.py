@@ -12,6 +12,13 @@ from reflfield.report.sections.base_surface import (
     normals_section,
     silhouettes_section,
 )
+from reflfield.report.sections.baseline_images import (
+    BASELINE_NAMES,
+    AnalysedImage,
+    AnalysedImages,
+    analysis_sections,
+    nearest_words,
+)
 from reflfield.report.sections.candidate_runs import (
     CandidateRun,
     candidate_runs_section,
@@ -38,6 +45,9 @@ from reflfield.report.sections.size_and_quality import (
 from reflfield.report.sections.truth_scores import truth_section
 
 __all__ = [
+    "BASELINE_NAMES",
+    "AnalysedImage",
+    "AnalysedImages",
     "CandidateRun",
     "CountedItems",
     "FieldVariant",
@@ -46,6 +56,7 @@ __all__ = [
     "StageSummary",
     "ablation_section",
     "alignment_section",
+    "analysis_sections",
     "atlas_section",
     "bookkeeping_section",
     "candidate_runs_section",
@@ -55,6 +66,7 @@ __all__ = [
     "held_out_section",
     "key_numbers",
     "metrics_table",
+    "nearest_words",
     "normals_section",
     "rate_distortion_section",
     "rules_section",

@@ -1,0 +1,99 @@
+"""Baselines and kinds of errors of a run and of `compare`: in metrics, console and page."""
+
+import json
+
+import numpy as np
+import pytest
+
+from reflfield.capture.readers import open_capture
+from reflfield.metrics.error_kinds import KINDS
+from reflfield.metrics.image_errors import psnr
+from reflfield.options import HoldOut
+from reflfield.pipeline.hold_out import split_of
+from reflfield.render.exposure import display, object_pixels
+
+NAMES = ("black", "nearest_photograph", "mean_texture")
+
+
+@pytest.fixture(scope="module")
+def metrics(finished):
+    return json.loads((finished.folder / "metrics.json").read_text())
+
+
+def test_black_gets_what_a_black_image_gets(metrics, finished, tiny_capture):
+    capture = open_capture(tiny_capture)
+    frames = split_of(capture, HoldOut(1, 1)).frames(capture)
+    stored = json.loads((finished.folder / "stages/comparison/field/heldout.json").read_text())
+    exposure = stored["extra"]["exposure"]
+    (frame,) = metrics["baselines"]["black"]["frames"]
+    counted = object_pixels(frames.read_silhouette(0))
+    shown = display(frames.read_photograph(0)[counted], exposure)
+    assert frame["name"] == frames.photographs[0].name
+    assert frame["n_pixels"] == counted.sum()
+    assert frame["psnr_ldr"] == pytest.approx(psnr(shown, np.zeros_like(shown)), abs=1e-6)
+
+
+def test_the_baselines_are_those_of_the_compared_photographs(metrics):
+    baselines = metrics["baselines"]
+    assert baselines["missing"] == {}
+    for name in NAMES:
+        frames = baselines[name]["frames"]
+        assert [f["name"] for f in frames] == [f["name"] for f in metrics["frames"]]
+        assert [f["n_pixels"] for f in frames] == [f["n_pixels"] for f in metrics["frames"]]
+    # A satin ball of one colour: a field, however coarse, is better than nothing.
+    assert metrics["mean"]["psnr_ldr"] > baselines["black"]["mean"]["psnr_ldr"] + 6
+
+
+def test_the_nearest_photograph_is_one_that_made_the_field(metrics, tiny_capture):
+    capture = open_capture(tiny_capture)
+    split = split_of(capture, HoldOut(1, 1))
+    trained = {p.name for p in split.training(capture).photographs}
+    (nearest,) = metrics["baselines"]["nearest_photograph"]["nearest"]
+    assert nearest["photograph"] in trained
+    assert nearest["view_degrees"] > 10
+    assert nearest["light_degrees"] > 10
+
+
+def test_shares_of_the_kinds_sum_to_one_and_to_the_error(metrics):
+    kinds = metrics["error_kinds"]["kinds"]
+    assert list(kinds) == list(KINDS)
+    for share in ("share_of_pixels", "share_of_squared_error"):
+        assert sum(kind[share] for kind in kinds.values()) == pytest.approx(1, abs=1e-9)
+    # Of one photograph the errors of all kinds together are its PSNR.
+    squares = sum(
+        kind["share_of_pixels"] * 10 ** (-kind["psnr_ldr"] / 10)
+        for kind in kinds.values()
+        if kind["psnr_ldr"] is not None
+    )
+    assert -10 * np.log10(squares) == pytest.approx(metrics["mean"]["psnr_ldr"], abs=1e-6)
+
+
+def test_the_command_and_the_page_say_it(finished):
+    for text in ("baseline nearest photograph: PSNR", "baseline mean texture: PSNR",
+                 "baseline black: PSNR", "squared error: "):  # fmt: skip
+        assert text in finished.outcome.out
+    page = (finished.folder / "report" / "index.html").read_text()
+    for text in ("<h2>Trivial baselines</h2>", "<h2>Where the error lies</h2>",
+                 "<td>mean texture</td>", "<td>shadow edge</td>"):  # fmt: skip
+        assert text in page
+
+
+def test_compare_says_that_there_are_no_photographs_of_the_field(
+    reflfield, finished, tiny_capture, tmp_path
+):
+    """Unseen photographs are a capture of their own: those that made the field are named."""
+    field, unseen = finished.folder / "field.rfld", tiny_capture / "truth" / "heldout.json"
+    words = ("compare", field, unseen, "--rays-per-pixel", "1")
+    outcome = reflfield(*words, "-o", tmp_path / "without")
+    assert outcome.status == 0, outcome.err
+    assert (
+        "baseline nearest photograph: none; the photographs that made the field are not at "
+        "hand; name their capture with --photographs"
+    ) in outcome.out
+    without = json.loads((tmp_path / "without" / "metrics.json").read_text())
+    assert set(without["baselines"]) & set(NAMES) == {"black", "mean_texture"}
+    outcome = reflfield(*words, "-o", tmp_path / "with", "--photographs", tiny_capture)
+    assert outcome.status == 0, outcome.err
+    found = json.loads((tmp_path / "with" / "metrics.json").read_text())
+    assert len(found["baselines"]["nearest_photograph"]["frames"]) == 2
+    assert found["baselines"]["black"] == without["baselines"]["black"]
