@@ -18,7 +18,7 @@ from string import Template
 from typing import Any
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.lights import DIRECTIONAL, POINT, Light
+from reflfield.capture.lights import DIRECTIONAL, POINT, UNKNOWN, Light
 from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.util.files import replacing
@@ -69,7 +69,7 @@ class Bookmark:
 def can_be_shown(camera: Camera, light: Light) -> bool:
     """Whether the page can draw what a camera sees under a light."""
     kinds = {single.kind for single in light.sources}
-    return camera.keeps_lines_straight and kinds <= {POINT, DIRECTIONAL}
+    return camera.keeps_lines_straight and kinds <= {POINT, DIRECTIONAL, UNKNOWN}
 
 
 def write_object_page(
@@ -103,7 +103,10 @@ def write_object_page(
 
 
 def object_page(
-    field: ReflectanceField, name: str = "", bookmarks: Sequence[Bookmark] = ()
+    field: ReflectanceField,
+    name: str = "",
+    bookmarks: Sequence[Bookmark] = (),
+    most_bytes: int = MOST_BYTES,
 ) -> str:
     """The page as HTML text; same content, same text.
 
@@ -114,11 +117,13 @@ def object_page(
         Of the object; that of the field's capture by default.
     bookmarks : sequence of Bookmark
         Photographs to compare with.
+    most_bytes : int
+        Of the page.
 
     Raises
     ------
     InputError
-        If the page would be larger than `MOST_BYTES`.
+        If the page would be larger.
     """
     asset = page_asset(field)
     script = '"use strict";\n(() => {\n' + "\n".join(map(_file, SCRIPTS)) + "})();\n"
@@ -131,17 +136,28 @@ def object_page(
         style_hash=_digest(style),
         style=style,
         script=script,
-        header=_json(asset.header),
-        bookmarks=_json([_described(bookmark) for bookmark in bookmarks]),
+        header=_json(asset.header | {"bookmarks": list(map(_described, bookmarks))}),
+        pictures=_json([_data_url(bookmark) for bookmark in bookmarks]),
         block_0=blocks[0],
         block_1=blocks[1],
     )
-    if len(text) > MOST_BYTES:
+    if len(text) > most_bytes:
         raise InputError(
-            f"page: expected at most {MOST_BYTES:,} bytes, received {len(text):,}; make a "
+            f"page: expected at most {most_bytes:,} bytes, received {len(text):,}; make a "
             "smaller field with `reflfield run --size`"
         )
     return text
+
+
+def too_large_page(name: str) -> str:
+    """A page that stands for one that would be too large, and says what to do."""
+    title = escape(printable(name))
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>\n'
+        f"<h1>{title}</h1>\n<p>This field is too large for one file. See it with "
+        "<code>reflfield view field.rfld</code>, or make a smaller one with "
+        "<code>reflfield run --size</code>.</p>\n</html>\n"
+    )
 
 
 def title_of(field: ReflectanceField) -> str:
@@ -179,15 +195,18 @@ def _described(bookmark: Bookmark) -> dict[str, Any]:
     """A bookmark as the script reads it."""
     names = ("kind", "width", "height", "fl_x", "fl_y", "cx", "cy")
     camera = {name: getattr(bookmark.camera, name) for name in names}
-    encoded = base64.b64encode(bookmark.picture).decode("ascii")
     return {
         "name": printable(bookmark.name),
         "note": printable(bookmark.note),
         "exposure": bookmark.exposure,
         "camera": camera | {"camera_from_world": bookmark.camera.camera_from_world.tolist()},
         "lights": [_light(light) for light in bookmark.lights],
-        "picture": f"data:{bookmark.media_type};base64,{encoded}",
     }
+
+
+def _data_url(bookmark: Bookmark) -> str:
+    encoded = base64.b64encode(bookmark.picture).decode("ascii")
+    return f"data:{bookmark.media_type};base64,{encoded}"
 
 
 def _light(light: Light) -> dict[str, Any]:

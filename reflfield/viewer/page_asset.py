@@ -22,14 +22,14 @@ from reflfield.field.array_schemas import INDIRECT_ARRAYS, SCHEMAS
 from reflfield.field.evaluation import evaluate
 from reflfield.field.observed_sphere import covered, table_directions
 from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
-from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.mesh import Mesh, welded
 
 FORMAT, VERSION = "reflfield-object", 1
 FIRST_ARRAYS = ("positions", "position_box", "faces", "uv", "uv_box")
 # Largest side of the preview, pixels.
 PREVIEW_SIDE = 256
 # Steps of the table of indirect light from 0 to the largest value of a function.
-TABLE_STEPS = 2047
+TABLE_STEPS = 511
 PREVIEW_PERCENTILE = 99.0
 
 
@@ -73,7 +73,7 @@ def page_asset(field: ReflectanceField) -> PageAsset:
     PageAsset
     """
     first: dict[str, NDArray[Any]] = {name: field.arrays[name] for name in FIRST_ARRAYS}
-    first["preview"] = preview(field)
+    first["preview"] = texel_image(field, -(-max(field.texel_of_pixel.shape) // PREVIEW_SIDE))
     rest = {n: field.arrays[n] for n in SCHEMAS[field.model] if n not in FIRST_ARRAYS}
     rest = {name: array for name, array in rest.items() if name not in INDIRECT_ARRAYS}
     has_indirect = field.visibility == "factored" and not field.indirect.is_black
@@ -98,9 +98,8 @@ def texel_colours(field: ReflectanceField) -> NDArray[np.uint8]:
     return np.rint(np.asarray(encode_srgb(exposed)) * 255).astype(np.uint8)
 
 
-def preview(field: ReflectanceField, largest_side: int = PREVIEW_SIDE) -> NDArray[np.uint8]:
+def texel_image(field: ReflectanceField, step: int = 1) -> NDArray[np.uint8]:
     """Texture of `texel_colours`, every n-th pixel of it, (height, width, 3); 0 where none."""
-    step = -(-max(field.texel_of_pixel.shape) // largest_side)
     texels = field.texel_of_pixel[::step, ::step]
     image = texel_colours(field)[np.maximum(texels, 0)]
     return np.where(texels[..., None] >= 0, image, np.uint8(0))
@@ -118,7 +117,7 @@ def packed_block(arrays: Mapping[str, NDArray[Any]]) -> PackedBlock:
     entries, parts, start = [], [], 0
     for name, given in arrays.items():
         array = np.ascontiguousarray(given).astype(given.dtype.newbyteorder("<"))
-        content, way = min(_packings(array), key=lambda one: len(zlib.compress(one[0], 6)))
+        content, way = min(_packings(array), key=lambda one: len(zlib.compress(one[0], 1)))
         entry = {"name": name, "dtype": array.dtype.name, "shape": list(array.shape)}
         entries.append({**entry, **way, "start": start})
         parts.append(content)
@@ -142,12 +141,8 @@ def _packings(array: NDArray[Any]) -> Iterator[tuple[bytes, dict[str, Any]]]:
 
 
 def _header(field: ReflectanceField, has_indirect: bool) -> dict[str, Any]:
-    codes, numbers = np.unique(field.arrays["positions"], axis=0, return_inverse=True)
-    welded = Mesh(codes.astype(np.float64), numbers.reshape(-1)[field.faces])
     mesh = Mesh(field.positions, field.faces)
-    sides = (
-        [field.view_side, field.light_side] if isinstance(field, ClusteredField) else [0, 0]
-    )
+    sides = [field.view_side, field.light_side] if isinstance(field, ClusteredField) else [0, 0]
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -160,7 +155,7 @@ def _header(field: ReflectanceField, has_indirect: bool) -> dict[str, Any]:
         "up": field.up.tolist(),
         "texel_width": float(np.sqrt(mesh.area / field.n_texels)),
         # Of a closed surface shadow maps hold the far sides, which need no bias.
-        "closed": welded.watertight,
+        "closed": welded(mesh)[0].watertight,
     }
 
 

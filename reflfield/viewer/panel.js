@@ -91,6 +91,12 @@ class Panel {
     element("full").hidden = !document.documentElement.requestFullscreen;
   }
 
+  // Photographs come last in the page.
+  pictures() {
+    this.read = this.read || JSON.parse(element("pictures").textContent);
+    return this.read;
+  }
+
   photographs() {
     const { bookmarks } = this.viewer;
     element("photographs").hidden = !bookmarks.length;
@@ -164,7 +170,7 @@ class Panel {
     });
     const image = element("photograph-image"), share = Number(element("wipe").value);
     if (image.dataset.number !== String(viewer.scene.photo)) {
-      image.src = photo.picture;
+      image.src = this.pictures()[viewer.scene.photo];
       image.alt = `Photograph ${photo.name}`;
       image.dataset.number = String(viewer.scene.photo);
     }

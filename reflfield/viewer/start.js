@@ -2,7 +2,7 @@
 
 const reflfield = window.reflfield = { ready: null, error: "" };
 const header = JSON.parse(element("header").textContent);
-const bookmarks = JSON.parse(element("bookmarks").textContent);
+const { bookmarks } = header;
 const motionIsWelcome = !matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 let viewer = null, panel = null, handles = null, turning = 0, swaying = 0, touchedOnce = false;
