@@ -191,28 +191,30 @@ def _json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _described(bookmark: Bookmark) -> dict[str, Any]:
-    """A bookmark as the script reads it."""
+def camera_values(camera: Camera) -> dict[str, Any]:
+    """A camera as the script reads it."""
     names = ("kind", "width", "height", "fl_x", "fl_y", "cx", "cy")
-    camera = {name: getattr(bookmark.camera, name) for name in names}
+    values = {name: getattr(camera, name) for name in names}
+    return values | {"camera_from_world": camera.camera_from_world.tolist()}
+
+
+def light_values(light: Light) -> dict[str, Any]:
+    """A light as the script reads it."""
+    vectors = ("position", "direction", "intensity")
+    return {"kind": light.kind} | {name: getattr(light, name).tolist() for name in vectors}
+
+
+def _described(bookmark: Bookmark) -> dict[str, Any]:
+    """A bookmark as the script reads it, without its picture."""
     return {
         "name": printable(bookmark.name),
         "note": printable(bookmark.note),
         "exposure": bookmark.exposure,
-        "camera": camera | {"camera_from_world": bookmark.camera.camera_from_world.tolist()},
-        "lights": [_light(light) for light in bookmark.lights],
+        "camera": camera_values(bookmark.camera),
+        "lights": [light_values(light) for light in bookmark.lights],
     }
 
 
 def _data_url(bookmark: Bookmark) -> str:
     encoded = base64.b64encode(bookmark.picture).decode("ascii")
     return f"data:{bookmark.media_type};base64,{encoded}"
-
-
-def _light(light: Light) -> dict[str, Any]:
-    return {
-        "kind": light.kind,
-        "position": light.position.tolist(),
-        "direction": light.direction.tolist(),
-        "intensity": light.intensity.tolist(),
-    }

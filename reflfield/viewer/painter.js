@@ -28,7 +28,9 @@ class Painter {
     this.adding = compiledProgram(gl, FULL_SCREEN, ADD_UP);
     this.depthOnly = compiledProgram(gl, VERTEX, DEPTH_ONLY);
     this.nothing = gl.createVertexArray();
-    this.counts = { passes: 0 };
+    const named = gl.getExtension("WEBGL_debug_renderer_info");
+    const renderer = named ? gl.getParameter(named.UNMASKED_RENDERER_WEBGL) : "";
+    this.isSoftware = /swiftshader|llvmpipe|software/i.test(renderer);
   }
 
   setSurface(surface, header, preview) {
@@ -165,7 +167,6 @@ class Painter {
     this.setLamps(places, lamps);
     this.drawMesh();
     gl.disable(gl.BLEND);
-    this.counts.passes += 1;
   }
 
   setLamps(places, lamps) {

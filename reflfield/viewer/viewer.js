@@ -41,7 +41,8 @@ class Viewer {
 
   startField() {
     const small = Math.min(screen.width, screen.height) < 600 || (navigator.deviceMemory || 8) < 4;
-    this.painter.setField(this.field, small ? 1024 : 2048);
+    const side = this.painter.isSoftware ? 512 : small ? 1024 : 2048;
+    this.painter.setField(this.field, side);
   }
 
   // After the graphics card was lost: the same objects again.
