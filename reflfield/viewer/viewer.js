@@ -67,9 +67,8 @@ class Viewer {
 
   // Exposure that brings the default view under the default light to the usual brightness.
   measuredExposure() {
-    const free = [0, 0, 96, 96];
     const camera = orbitCamera({ ...this.defaults.camera, distance: 4 }, this.frame,
-      { width: 96, height: 96, free });
+      { width: 64, height: 64, free: [0, 0, 64, 64] });
     const numbers = this.painter.numbers(camera, this.lampsOf(this.defaults, camera, []),
       { rays: [[0.5, 0.5]] });
     const values = [];

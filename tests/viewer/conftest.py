@@ -34,7 +34,7 @@ def open_page(browser, tmp_path):
     """
     pages, errors = [], []
 
-    def opened(html, fragment="", *, size=(240, 240), waits=True, errors_matter=True):
+    def opened(html, fragment="", *, size=(64, 64), waits=True, errors_matter=True):
         path = tmp_path / f"object{len(pages)}.html"
         path.write_text(html, encoding="utf-8")
         page = browser.new_page(
