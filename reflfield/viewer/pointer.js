@@ -108,12 +108,15 @@ class LampHandles {
   // Middle and radius of the sphere in pixels of the window.
   sphere(camera) {
     const middle = camera.rows.map((row) => -dot(row, camera.eye));
-    const ratio = this.viewer.canvas.clientWidth / camera.width;
+    const { canvas } = this.viewer, ratio = canvas.clientWidth / camera.width;
     const depth = Math.max(middle[2], 0.1);
+    const [left, top, width, height] = this.viewer.free(canvas.clientWidth, canvas.clientHeight);
+    const place = (axis, from, size) => clamp(
+      (camera.centre[axis] + camera.focal[axis] * middle[axis] / depth) * ratio, from, from + size);
     return {
-      x: (camera.centre[0] + camera.focal[0] * middle[0] / depth) * ratio,
-      y: (camera.centre[1] + camera.focal[1] * middle[1] / depth) * ratio,
-      radius: Math.max(1.05 * camera.focal[0] / depth * ratio, 60),
+      x: place(0, left, width), y: place(1, top, height),
+      // Where the object is larger than the window, the dots stay in it.
+      radius: clamp(1.05 * camera.focal[0] / depth * ratio, 60, 0.46 * Math.min(width, height)),
     };
   }
 

@@ -1,4 +1,4 @@
-"""Every control of the page, used as a person does, and what it says when something is wrong."""
+"""Every control of the page, used as a person does, and what it says of what is wrong."""
 
 import base64
 import io
@@ -16,6 +16,7 @@ from reflfield.viewer.object_page import Bookmark, object_page
 from tests.viewer.shown_fields import half_vector_field, planar_field
 
 WINDOW = (900, 620)
+NOT_REFINED = "() => { reflfield.viewer().refine = function () { this.refining = null; }; }"
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +35,7 @@ def page(open_page, html):
     opened = open_page(html, size=WINDOW)
     # Drawing stops after each image of what moves: what is refined here is tested elsewhere.
     opened.evaluate("() => { reflfield.viewer().movingScale = 0.1; }")
-    opened.evaluate(
-        "() => { reflfield.viewer().refine = function () { this.refining = null; }; }"
-    )
+    opened.evaluate(NOT_REFINED)
     return opened
 
 
@@ -187,12 +186,17 @@ class TestPanel:
 def test_keys(page):
     page.locator("#picture").focus()
     changes = {
-        "ArrowLeft": lambda s: s["camera"]["azimuth"], "ArrowUp": lambda s: s["camera"]["elevation"],
-        "Shift+ArrowRight": lambda s: s["lamps"][0]["azimuth"], "+": lambda s: s["camera"]["distance"],
-        "-": lambda s: s["camera"]["distance"], "2": lambda s: s["lamps"][1]["on"],
-        "f": lambda s: s["flash"], "e": lambda s: s["map"]["name"], "v": lambda s: s["show"],
+        "ArrowLeft": lambda s: s["camera"]["azimuth"],
+        "ArrowUp": lambda s: s["camera"]["elevation"],
+        "Shift+ArrowRight": lambda s: s["lamps"][0]["azimuth"],
+        "+": lambda s: s["camera"]["distance"],
+        "-": lambda s: s["camera"]["distance"],
+        "2": lambda s: s["lamps"][1]["on"],
+        "f": lambda s: s["flash"],
+        "e": lambda s: s["map"]["name"],
+        "v": lambda s: s["show"],
         "r": lambda s: s["flash"],
-    }  # fmt: skip
+    }
     for key, value in changes.items():
         before = value(scene(page))
         page.keyboard.press(key)
@@ -236,9 +240,7 @@ def test_links_that_make_no_sense_are_harmless(open_page, html, fragment):
 
 def test_on_a_phone_the_picture_comes_first(open_page, html):
     page = open_page(html, size=(390, 760))
-    page.evaluate(
-        "() => { reflfield.viewer().refine = function () { this.refining = null; }; }"
-    )
+    page.evaluate(NOT_REFINED)
     assert page.locator("#panel").is_hidden()
     button = page.locator("#panel-toggle")
     assert button.bounding_box()["height"] >= 44
@@ -404,9 +406,7 @@ class TestErrors:
 
 def test_one_unknown_light_offers_no_lights(open_page):
     page = open_page(object_page(planar_field("unknown")), size=WINDOW)
-    page.evaluate(
-        "() => { reflfield.viewer().refine = function () { this.refining = null; }; }"
-    )
+    page.evaluate(NOT_REFINED)
     assert page.locator("#lights").is_hidden()
     assert page.locator("#surroundings").is_hidden()
     assert page.locator(".lamp-handle").first.is_hidden()
