@@ -116,7 +116,7 @@ class LampHandles {
     return {
       x: place(0, left, width), y: place(1, top, height),
       // Where the object is larger than the window, the dots stay in it.
-      radius: clamp(1.05 * camera.focal[0] / depth * ratio, 60, 0.46 * Math.min(width, height)),
+      radius: clamp(1.05 * camera.focal[0] / depth * ratio, 60, 0.43 * Math.min(width, height)),
     };
   }
 
@@ -125,7 +125,8 @@ class LampHandles {
     this.camera = camera;
     this.buttons.forEach((button, i) => {
       const lamp = scene.lamps[i];
-      button.hidden = !lamp.on || scene.photo !== null || scene.show !== "picture";
+      const shown = this.viewer.header.known_light && scene.photo === null;
+      button.hidden = !(shown && lamp.on && scene.show === "picture");
       if (button.hidden) return;
       const [right, down, forward] = camera.rows.map((row) => dot(row, lampDirection(frame, lamp)));
       button.classList.toggle("behind", forward > 0);

@@ -26,31 +26,50 @@ def browser():
         running.close()
 
 
-@pytest.fixture
-def open_page(browser, tmp_path):
-    """Function from HTML text to a page whose object is there; fails on errors it logs.
+class Pages:
+    """Pages opened from files, as a user opens them who got them by mail."""
 
-    The page is opened from a file, as a user opens it who got it by mail.
-    """
-    pages, errors = [], []
+    def __init__(self, browser, folder):
+        self.browser, self.folder = browser, folder
+        self.opened, self.errors = [], []
 
-    def opened(html, fragment="", *, size=(64, 64), waits=True, errors_matter=True):
-        path = tmp_path / f"object{len(pages)}.html"
+    def open(self, html, fragment="", *, size=(64, 64), waits=True, errors_matter=True):
+        """A page whose object is there; what it logs as an error counts."""
+        path = self.folder / f"object{len(self.opened)}.html"
         path.write_text(html, encoding="utf-8")
-        page = browser.new_page(
+        page = self.browser.new_page(
             viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce"
         )
         page.set_default_timeout(60_000)
-        pages.append(page)
+        self.opened.append(page)
         if errors_matter:
-            page.on("pageerror", lambda error: errors.append(str(error)))
-            page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+            page.on("pageerror", lambda error: self.errors.append(str(error)))
+            page.on(
+                "console", lambda m: self.errors.append(m.text) if m.type == "error" else None
+            )
         page.goto(f"{path.as_uri()}{'#' + fragment if fragment else ''}")
         if waits:
             page.evaluate("reflfield.ready")
         return page
 
-    yield opened
-    for page in pages:
-        page.close()
-    assert errors == []
+    def close(self):
+        """Close all; what they logged is the test's error."""
+        for page in self.opened:
+            page.close()
+        assert self.errors == []
+
+
+@pytest.fixture
+def open_page(browser, tmp_path):
+    """Function from HTML text to a page, as `Pages.open`."""
+    pages = Pages(browser, tmp_path)
+    yield pages.open
+    pages.close()
+
+
+@pytest.fixture(scope="module")
+def open_shared_page(browser, tmp_path_factory):
+    """The same for pages that all tests of a module use."""
+    pages = Pages(browser, tmp_path_factory.mktemp("pages"))
+    yield pages.open
+    pages.close()

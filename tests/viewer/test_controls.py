@@ -29,14 +29,30 @@ def html():
     return object_page(half_vector_field(), "two spheres", [bookmark])
 
 
-@pytest.fixture
-def page(open_page, html):
+@pytest.fixture(scope="module")
+def only_page(html, open_shared_page):
     """The page at a small scale, so that the software renderer keeps up."""
-    opened = open_page(html, size=WINDOW)
-    # Drawing stops after each image of what moves: what is refined here is tested elsewhere.
+    opened = open_shared_page(html, size=WINDOW)
     opened.evaluate("() => { reflfield.viewer().movingScale = 0.1; }")
+    # What is refined once all is still is tested elsewhere.
     opened.evaluate(NOT_REFINED)
     return opened
+
+
+@pytest.fixture
+def page(only_page):
+    """The page as it was when it was opened."""
+    only_page.evaluate("reflfield.act.reset()")
+    only_page.evaluate("document.querySelector('input[name=drag]').checked = true")
+    only_page.evaluate("reflfield.act.panel(true)")
+    settled(only_page)
+    return only_page
+
+
+def settled(page):
+    """Wait until what was asked for is drawn."""
+    while not page.evaluate("reflfield.viewer().isStill"):
+        page.wait_for_timeout(20)
 
 
 def scene(page):
@@ -59,7 +75,7 @@ class TestMouse:
         assert turned["azimuth"] < before["azimuth"]
         assert turned["elevation"] > before["elevation"]
         page.mouse.wheel(0, 300)
-        page.wait_for_timeout(50)
+        settled(page)
         zoomed = scene(page)["camera"]
         assert zoomed["distance"] > 1.2 * before["distance"]
         drag(page, (200, 300), [(240, 300)], button="right")
@@ -72,16 +88,16 @@ class TestMouse:
         box = dot.bounding_box()
         start = (box["x"] + 22, box["y"] + 22)
         drag(page, start, [(start[0] - 30, start[1] + 40), (start[0] - 60, start[1] + 60)])
-        page.wait_for_timeout(300)
+        settled(page)
         after = dot.bounding_box()
         assert after["x"] + 22 == pytest.approx(start[0] - 60, abs=3)
         assert after["y"] + 22 == pytest.approx(start[1] + 60, abs=3)
         assert "behind" not in dot.get_attribute("class")
         middle = page.evaluate("(() => { const v = reflfield.viewer();"
                                " return v.free(innerWidth, innerHeight); })()")  # fmt: skip
-        end = (middle[0] + middle[2] - 30, 300)
+        end = (middle[0] + middle[2] + 60, 300)
         drag(page, (after["x"] + 22, after["y"] + 22), [(400, 300), end])
-        page.wait_for_timeout(300)
+        settled(page)
         assert "behind" in dot.get_attribute("class")
 
     def test_shift_drag_and_the_choice_move_the_light(self, page):
@@ -139,17 +155,17 @@ class TestPanel:
         assert "Tangents" in page.locator("#hint").text_content()
         for value in ("normals", "weights", "coverage", "picture"):
             page.locator("#show").select_option(value)
-            page.wait_for_timeout(100)
+            settled(page)
         assert page.locator("#hint").is_hidden()
 
     def test_photograph_beside_the_rendering(self, page):
         page.locator("#photo").select_option("0")
-        page.wait_for_timeout(300)
+        settled(page)
         box = page.locator("#photograph").bounding_box()
         assert box["width"] / box["height"] == pytest.approx(80 / 60, rel=0.01)
         assert page.locator("#hint").text_content() == "Held out."
         page.locator("#wipe").fill("25")
-        page.wait_for_timeout(100)
+        settled(page)
         style = page.locator("#photograph-image").evaluate("e => e.style.clipPath")
         assert "75%" in style
         # The camera is the photograph's: the origin is drawn where it shows it.
@@ -171,7 +187,7 @@ class TestPanel:
         picture = np.asarray(Image.open(download.value.path()).convert("RGB"), float)
         assert picture.std() > 5
         page.locator("#link").click()
-        page.wait_for_timeout(100)
+        settled(page)
         assert page.url.partition("#")[2].startswith("view=")
         page.locator("#help").click()
         assert page.locator("#keys").is_visible()
@@ -179,8 +195,9 @@ class TestPanel:
         page.locator("#reset").click()
         assert scene(page)["camera"]["azimuth"] == 0
         page.locator("#full").click()
-        page.wait_for_timeout(300)
+        settled(page)
         assert page.evaluate("Boolean(document.fullscreenElement)")
+        page.locator("#full").click()
 
 
 def test_keys(page):
@@ -200,7 +217,7 @@ def test_keys(page):
     for key, value in changes.items():
         before = value(scene(page))
         page.keyboard.press(key)
-        page.wait_for_timeout(50)
+        settled(page)
         assert value(scene(page)) != before, key
     page.keyboard.press("c")
     assert page.locator("#panel").is_hidden()
@@ -215,10 +232,11 @@ def test_a_link_restores_the_view(page, open_page, html):
     page.locator("#show").select_option("normals")
     drag(page, (200, 300), [(230, 320)])
     page.locator("#link").click()
-    page.wait_for_timeout(100)
+    settled(page)
     wanted, fragment = scene(page), page.url.partition("#")[2]
     found = scene(open_page(html, fragment))
-    assert found["camera"] == pytest.approx(wanted["camera"], rel=1e-4)
+    for name in ("azimuth", "elevation", "distance", "target"):
+        assert found["camera"][name] == pytest.approx(wanted["camera"][name], rel=1e-4)
     for name in ("flash", "exposure", "curve", "show", "backdrop", "photo", "map"):
         assert found[name] == wanted[name]
     assert [lamp["on"] for lamp in found["lamps"]] == [True, False, True]
@@ -262,10 +280,16 @@ class TestMaps:
         return rng.uniform(0.1, 2.0, (16, 32, 3)).astype(np.float32)
 
     def dropped(self, page, name, content):
+        page.evaluate("document.querySelector('#message').hidden = true")
         page.locator("#map-file").set_input_files(
             {"name": name, "mimeType": "application/octet-stream", "buffer": content}
         )
-        page.wait_for_timeout(500)
+        answered = (
+            "reflfield.viewer().mapLights.still.length > 0"
+            " || !document.querySelector('#message').hidden"
+        )
+        while not page.evaluate(answered):
+            page.wait_for_timeout(20)
         return page.evaluate("reflfield.viewer().mapLights.still")
 
     def expected(self, radiance):
@@ -394,7 +418,7 @@ class TestErrors:
         assert "graphics card" in page.locator("#message").text_content()
         page.evaluate("loss.restoreContext()")
         page.locator("#message").wait_for(state="hidden")
-        page.wait_for_timeout(500)
+        settled(page)
         assert page.evaluate("reflfield.viewer().frames.moving") > before
         # What is drawn again is the object, not an empty picture.
         lit = page.evaluate(
