@@ -12,7 +12,7 @@ function defaultScene(isFlat) {
     ({ on, azimuth: azimuth * DEGREE, elevation: elevation * DEGREE, distance: REFERENCE_DISTANCE, colour, strength: 0 });
   return {
     camera: { azimuth: 0, elevation: isFlat ? 0 : 15 * DEGREE, distance: 4, target: [0, 0, 0] },
-    lamps: [lamp(true, 35, 48, "#ffffff"), lamp(false, -60, 25, "#9cc4ff"), lamp(false, 150, 30, "#ffb070")],
+    lamps: [lamp(true, 30, 32, "#ffffff"), lamp(false, -60, 25, "#9cc4ff"), lamp(false, 150, 30, "#ffb070")],
     flash: false,
     map: { name: "none", rotation: 0, strength: 0 },
     exposure: 0, curve: "soft", show: "picture", backdrop: "dark", photo: null,

@@ -41,6 +41,7 @@ const act = {
   touched() {
     touchedOnce = true;
     swaying = 0;
+    element("subtitle").hidden = true;
   },
   async map(name) {
     if (name === "file") {

@@ -13,6 +13,7 @@ class Viewer {
     this.onDrawn = () => {};
     this.frameRequested = false;
     this.movingScale = 1;
+    this.cost = 0;
     this.free = (width, height) => [0, 0, width, height];
     this.frames = { moving: 0, still: 0 };
   }
@@ -48,6 +49,7 @@ class Viewer {
   // After the graphics card was lost: the same objects again.
   restart() {
     this.painter = new Painter(this.canvas);
+    this.fence = null;
     this.painter.setSurface(this.surface, this.header, this.preview);
     if (this.field) this.startField();
     this.changed();
@@ -124,26 +126,47 @@ class Viewer {
   }
 
   drawFrame(time) {
-    const interval = time - (this.lastFrame || 0);
-    this.lastFrame = time;
+    if (!this.cardIsReady(time)) {
+      this.requestFrame();
+      return;
+    }
     if (this.animate && this.animate(time)) this.moved = true;
     if (this.moved) {
-      this.adapt(interval);
+      this.adapt();
       this.moved = false;
       this.drawMoving();
       this.refining = { ray: 0, batch: 0 };
-      this.requestFrame();
     } else if (this.refining) {
-      const passes = interval > 45 ? 1 : 4;
+      const passes = this.cost > 40 ? 1 : 4;
       for (let i = 0; i < passes && this.refining; i++) this.refine();
-      if (this.refining) this.requestFrame();
-    }
+    } else return;
+    this.watchCard(time);
+    this.requestFrame();
+  }
+
+  // Whether the graphics card has done what it was given: work that waits in its queue would
+  // delay what the user does next. `cost` is how long it took, milliseconds.
+  cardIsReady(time) {
+    const { gl } = this.painter;
+    if (!this.fence) return true;
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    this.cost = time - this.given;
+    return true;
+  }
+
+  watchCard(time) {
+    const { gl } = this.painter;
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.given = time;
   }
 
   // Images of fewer pixels where frames take long, only as long as something moves.
-  adapt(interval) {
-    if (this.wasMoving && interval > 70) this.movingScale = Math.max(this.movingScale * 0.75, 0.3);
-    else if (this.wasMoving && interval < 24) this.movingScale = Math.min(this.movingScale * 1.05, 1);
+  adapt() {
+    if (this.wasMoving && this.cost > 70) this.movingScale = Math.max(this.movingScale * 0.75, 0.3);
+    else if (this.wasMoving && this.cost < 24) this.movingScale = Math.min(this.movingScale * 1.05, 1);
     this.wasMoving = true;
   }
 
