@@ -345,6 +345,55 @@ def compare(
 
 
 @app.command()
+def view(
+    field: Annotated[Path, typer.Argument(help="A field.rfld.")],
+    port: Annotated[int, typer.Option(help="Of this machine; 0 takes a free one.")] = 0,
+    open_: Annotated[
+        bool,
+        typer.Option("--open/--no-open", help="Open the browser, or only say the address."),
+    ] = True,
+    max_memory: MaxMemory = "4GB",
+) -> None:
+    """Show a field in the browser: turn it, move the light. Ctrl-C ends.
+
+    The page is served to this machine alone.
+    """
+    import webbrowser
+
+    from reflfield.api.fields import open_field
+    from reflfield.options import parse_bytes
+    from reflfield.viewer.object_page import object_page
+    from reflfield.viewer.page_server import PageServer
+
+    most_bytes = parse_bytes(max_memory)
+    stored = open_field(field, max_memory=most_bytes).stored
+    page = object_page(stored, most_bytes=most_bytes).encode()
+    with PageServer(page, port) as server, showing_progress("the page is no longer served"):
+        say(server.url)
+        if open_ and not webbrowser.open(server.url):
+            say_error("reflfield: note: no browser found; open the address in one")
+        server.serve_forever()
+
+
+@app.command()
+def export(
+    field: Annotated[Path, typer.Argument(help="A field.rfld.")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILE", help="Such as OBJECT.html.")
+    ],
+    to: Annotated[str, typer.Option(metavar="html|gltf", help="Format of the file.")] = "html",
+    max_memory: MaxMemory = "4GB",
+) -> None:
+    """Write a field as one web page that shows and relights it, or its mesh as glTF."""
+    from reflfield.api.fields import open_field
+    from reflfield.export.formats import export_field
+    from reflfield.options import parse_bytes
+
+    export_field(open_field(field, max_memory=parse_bytes(max_memory)).stored, out, to)
+    say(str(out))
+
+
+@app.command()
 def inspect(
     path: Annotated[Path, typer.Argument(help="A capture or a field.rfld.")],
     max_memory: MaxMemory = "4GB",

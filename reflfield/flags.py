@@ -35,6 +35,9 @@ FLAGS = {
     "environment_rotation": "--environment-rotation",
     "light": "--light",
     "samples_per_pixel": "--rays-per-pixel",
+    "to": "--to",
+    "out": "--out",
+    "port": "--port",
 }
 # Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
 RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}

@@ -24,6 +24,7 @@ PACKAGES = (
     "render",
     "fitting",
     "metrics",
+    "viewer",
     "export",
     "report",
     "pipeline",

@@ -202,6 +202,28 @@ def without_unused_vertices(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[used], renumbered.reshape(-1, 3).astype(np.int32))
 
 
+def welded(mesh: Mesh) -> tuple[Mesh, NDArray[np.intp]]:
+    """Join vertices at the same place, such as the two sides of a seam of texture coordinates.
+
+    Returns
+    -------
+    Mesh
+        Same faces, in the same order.
+    joined : (n,) intp
+        Its vertex for each vertex of the given mesh.
+
+    Examples
+    --------
+    >>> fold = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]],
+    ...             [[0, 1, 2], [3, 5, 4]])
+    >>> len(welded(fold)[0].vertices)
+    4
+    """
+    places, numbers = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    joined = numbers.reshape(-1)
+    return Mesh(places, joined[mesh.faces].astype(np.int32)), joined
+
+
 def without_degenerate_faces(mesh: Mesh) -> Mesh:
     """Drop faces that name a vertex twice and vertices left unused."""
     a, b, c = mesh.faces.T

@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 # What of a stage's folder goes to which place in the output folder, in the order listed.
 RESULTS = {
     "compression": {"field.rfld": "field.rfld"},
+    "web_page": {"object.html": "object.html"},
     "hull": {"hull.ply": "hull.ply"},
     "surface": {"surface.ply": "surface.ply"},
     "maps": {name: name for name in ("atlas.glb", "normals.exr", "tangents.exr")},

@@ -16,7 +16,14 @@ from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.metrics.held_out_photographs import RelitPairs
 from reflfield.metrics.image_metrics import Comparison
-from reflfield.pipeline import comparison, error_analysis, hold_out, model_selection, results
+from reflfield.pipeline import (
+    comparison,
+    error_analysis,
+    hold_out,
+    model_selection,
+    results,
+    web_page,
+)
 from reflfield.pipeline.analysis_report import analysed_images
 from reflfield.pipeline.atlas import METHOD
 from reflfield.pipeline.cache import plain, versions
@@ -96,6 +103,8 @@ def report_content(
             dict.fromkeys((*warnings_of(context), *(scores.problems if scores else ())))
         ),
         footer="" if counts is None else f"Stages in {context.stages.root.name}/",
+        # From where the two are published.
+        object_page=f"../{web_page.FILE}",
     )
 
 

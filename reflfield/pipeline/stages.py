@@ -39,6 +39,7 @@ from reflfield.pipeline import (
     stage_inputs,
     surface,
     visibility,
+    web_page,
     without_alignment,
 )
 from reflfield.pipeline.cache import StageFolder
@@ -245,6 +246,13 @@ RATE_DISTORTION = Stage(
     reads=stage_inputs.compared_digests,
     wanted=lambda context: context.options.shows_rate_distortion,
 )
+# the field as a web page, with photographs to compare with
+WEB_PAGE = Stage(
+    "web_page",
+    web_page.write_web_page,
+    after=(COMPRESSION, COMPARISON),
+    reads=web_page.page_digests,
+)
 # all results in one page
 REPORT = Stage(
     "report",
@@ -276,6 +284,7 @@ ORDER = (
     COMPARISON,
     ERROR_ANALYSIS,
     RATE_DISTORTION,
+    WEB_PAGE,
     REPORT,
 )
 STAGES = tuple(stage.name for stage in ORDER)

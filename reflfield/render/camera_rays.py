@@ -220,24 +220,34 @@ class FieldSurface:
     @cached_property
     def texels(self) -> TexelTable:
         """Texels of the field, in its order, as the mesh and its texture coordinates say."""
-        field = self.field
-        height, width = field.texel_of_pixel.shape
-        atlas = Atlas(
-            positions=field.positions,
-            faces=field.faces,
-            uv=np.clip(field.uv, 0.0, 1.0).astype(np.float64),
-            chart=np.zeros(len(field.faces), np.int32),
-            normals=self.mesh.vertex_normals,
-            height=height,
-            width=width,
-        )
-        table = texel_table(atlas)
-        return table.subset(_nearest_rows(field, table.pixel))
+        table = texel_table(field_atlas(self.field, self.mesh.vertex_normals))
+        return table.subset(_nearest_rows(self.field, table.pixel))
 
     @cached_property
     def texel_points(self) -> tuple[Array, Array]:
         """Positions and triangle normals of all texels, (n_texels, 3) each."""
         return self.texels.position, self.texels.face_normal.astype(np.float64)
+
+
+def field_atlas(field: ReflectanceField, vertex_normals: Array) -> Atlas:
+    """Base mesh of a field with its texture coordinates, as one chart.
+
+    Parameters
+    ----------
+    field : ReflectanceField
+    vertex_normals : (n_vertices, 3) float64
+        Unit vectors.
+    """
+    height, width = field.texel_of_pixel.shape
+    return Atlas(
+        positions=field.positions,
+        faces=field.faces,
+        uv=np.clip(field.uv, 0.0, 1.0).astype(np.float64),
+        chart=np.zeros(len(field.faces), np.int32),
+        normals=vertex_normals,
+        height=height,
+        width=width,
+    )
 
 
 def pixel_window(camera: Camera, mesh: Mesh) -> tuple[int, int, int, int]:

@@ -184,6 +184,8 @@ class ReportContent:
         Shown at the top.
     footer : str
         Such as version and date.
+    object_page : str
+        Address of the page that relights the object, relative to this one; none if empty.
     """
 
     title: str
@@ -192,6 +194,7 @@ class ReportContent:
     sections: tuple[Section, ...] = ()
     warnings: tuple[str, ...] = ()
     footer: str = ""
+    object_page: str = ""
 
 
 # --- pictures ---------------------------------------------------------------------
@@ -270,6 +273,7 @@ def render_report(content: ReportContent) -> str:
         title=escape(content.title),
         subtitle=_paragraph(content.subtitle, "subtitle"),
         key_numbers=_key_numbers(content.key_numbers),
+        links=_link(content.object_page, "Turn the object and move the light"),
         warnings=_warnings(content.warnings),
         navigation=_navigation(content.sections, anchors),
         sections="\n".join(
@@ -347,6 +351,14 @@ def _key_numbers(numbers: Sequence[KeyNumber]) -> str:
         for n in numbers
     )
     return f'<dl class="key-numbers">\n{cards}\n</dl>' if cards else ""
+
+
+def _link(address: str, words: str) -> str:
+    return (
+        f'<p class="link"><a href="{escape(address)}">{escape(words)}</a></p>'
+        if address
+        else ""
+    )
 
 
 def _warnings(texts: Sequence[str]) -> str:

@@ -22,7 +22,7 @@ from reflfield.render.exposure import object_pixels
 from reflfield.util import terminal
 from reflfield.util.progress import ProgressLines, listening, report
 
-COMMANDS = ("demo", "run", "relight", "compare", "inspect")
+COMMANDS = ("demo", "run", "relight", "compare", "view", "export", "inspect")
 
 
 class TestHelp:

@@ -27,7 +27,7 @@ BARE = (
             "reflfield.pipeline.report.report_content",
             OSError(122, "Disk quota exceeded"),
             {"field.rfld", "hull.ply", "atlas.glb", "normals.exr", "tangents.exr",
-             "metrics.json"},
+             "metrics.json", "object.html"},
         ),
     ],
 )  # fmt: skip

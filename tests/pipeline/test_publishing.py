@@ -23,7 +23,14 @@ SELECTED = PipelineOptions(
 OTHER_ALIGNMENT = replace(SELECTED, alignment=replace(SELECTED.alignment, enabled=False))
 OTHER_HULL = replace(SELECTED, hull=replace(SELECTED.hull, resolution=99))
 FIELD = {"field.rfld", "hull.ply"}
-LATER = {"atlas.glb", "normals.exr", "tangents.exr", "metrics.json", "report/index.html"}
+LATER = {
+    "object.html",
+    "atlas.glb",
+    "normals.exr",
+    "tangents.exr",
+    "metrics.json",
+    "report/index.html",
+}
 RECORDS = {"timings.json", "options.toml"}
 
 

@@ -26,6 +26,7 @@ SKIPPED = ("model_selection", "surface", "surface_visibility", "surface_observat
 RAN = tuple(stage for stage in STAGES if stage not in SKIPPED)
 FILES = (
     "field.rfld",
+    "object.html",
     "hull.ply",
     "atlas.glb",
     "normals.exr",

@@ -1,0 +1,1 @@
+"""The web page that shows and relights a field."""
