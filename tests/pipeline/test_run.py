@@ -114,7 +114,14 @@ class TestWhatARunLeaves:
     def test_metrics_have_the_documented_keys(self, finished):
         metrics = json.loads((finished.folder / "metrics.json").read_text())
         measured = {"psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
-        assert set(metrics) == {"frames", "mean", "measured", "held_out"}
+        assert set(metrics) == {
+            "frames",
+            "mean",
+            "measured",
+            "held_out",
+            "baselines",
+            "error_kinds",
+        }
         told = {"name", "n_excluded", "silhouette_from"}
         assert [set(frame) for frame in metrics["frames"]] == [told | measured]
         assert metrics["measured"]["silhouettes"] == {"given": 1}
