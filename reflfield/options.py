@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import os
 import re
 import sys
 import tomllib
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from numbers import Integral, Real
@@ -21,8 +20,8 @@ import tomli_w
 from reflfield.errors import InputError
 from reflfield.util.dask_cluster import check_installed
 from reflfield.util.files import read_bytes
+from reflfield.util.nested_tables import merged, with_current_names, without_removed
 
-log = logging.getLogger(__name__)
 Options = TypeVar("Options")
 # Options that were renamed, by their whole names, old -> new. Old names are accepted, with one
 # line of warning, until the next minor version.
@@ -118,88 +117,6 @@ def _toml_value(text: str) -> Any:
         return text
 
 
-def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of `first`, overridden option by option by `second`.
-
-    Examples
-    --------
-    >>> merged({"hull": {"blur": 1.0}, "seed": 1}, {"hull": {"tolerance": 2}})
-    {'hull': {'blur': 1.0, 'tolerance': 2}, 'seed': 1}
-    """
-    result = dict(first)
-    for name, value in second.items():
-        earlier = result.get(name)
-        both = isinstance(value, Mapping) and isinstance(earlier, Mapping)
-        result[name] = merged(earlier, value) if both else value  # type: ignore[arg-type]
-    return result
-
-
-def with_current_names(
-    tables: Mapping[str, Any], renamed: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """Return tables in which options that were renamed have their new names.
-
-    Parameters
-    ----------
-    tables : mapping
-        By name; nested. What has the new name already wins.
-    renamed : mapping of str to str, optional
-        New names by old ones, ``table.option``; `RENAMED_OPTIONS` by default.
-
-    Examples
-    --------
-    >>> logging.disable()
-    >>> with_current_names({"hull": {"side": 64}}, {"hull.side": "hull.resolution"})
-    {'hull': {'resolution': 64}}
-    >>> logging.disable(logging.NOTSET)
-    """
-    result = dict(tables)
-    for old, new in (RENAMED_OPTIONS if renamed is None else renamed).items():
-        holder, name = _holder_of(result, old)
-        if name in holder:
-            log.warning(
-                "option %r is now %r; the old name is accepted until version 0.2",
-                *(old, new),
-            )
-            value = holder[name]
-            result = _without(result, old.split("."))
-            for part in reversed(new.split(".")):
-                value = {part: value}
-            result = merged(value, result)
-    return result
-
-
-def without_removed(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Return tables without the options of `REMOVED_OPTIONS`, saying so."""
-    result = dict(tables)
-    for gone, reason in REMOVED_OPTIONS.items():
-        holder, name = _holder_of(result, gone)
-        if name in holder:
-            log.warning(
-                "option %r is gone: %s; it is ignored until version 0.2, remove it",
-                *(gone, reason),
-            )
-            result = _without(result, gone.split("."))
-    return result
-
-
-def _holder_of(tables: Mapping[str, Any], option: str) -> tuple[Mapping[str, Any], str]:
-    """Table that an option would stand in, empty if there is none, and its name there."""
-    *above, name = option.split(".")
-    holder: Any = tables
-    for part in above:
-        holder = holder.get(part) if isinstance(holder, Mapping) else None
-    return (holder if isinstance(holder, Mapping) else {}), name
-
-
-def _without(tables: Mapping[str, Any], path: Sequence[str]) -> dict[str, Any]:
-    """Return nested tables without the value at a path."""
-    name, *below = path
-    if below:
-        return {**tables, name: _without(tables[name], below)}
-    return {key: value for key, value in tables.items() if key != name}
-
-
 def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") -> Options:
     """Options with the values of nested tables in place of the defaults.
 
@@ -223,7 +140,8 @@ def with_tables(options: Options, tables: Mapping[str, Any], where: str = "") ->
         If a name is unknown (near names are suggested) or a value has the wrong type.
     """
     if not where:
-        tables = without_removed(with_current_names(tables))
+        tables = with_current_names(tables, RENAMED_OPTIONS)
+        tables = without_removed(tables, REMOVED_OPTIONS)
     hints = get_type_hints(type(options))
     known = [f.name for f in fields(options)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}

@@ -15,7 +15,6 @@ from reflfield.capture.capture import Capture
 from reflfield.options import (
     HoldOut,
     Resources,
-    merged,
     parse_settings,
     read_toml,
     with_tables,
@@ -29,6 +28,7 @@ from reflfield.pipeline.publishing import published
 from reflfield.pipeline.quantisation_search import missed_quality
 from reflfield.pipeline.report import problems_of
 from reflfield.pipeline.stages import run
+from reflfield.util.nested_tables import merged
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ from reflfield.capture.capture import PLANE
 from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
-from reflfield.options import HoldOut, merged, parse_settings, read_toml, with_tables
+from reflfield.options import HoldOut, parse_settings, read_toml, with_tables
 from reflfield.pipeline import model_selection
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import STAGES, run
+from reflfield.util.nested_tables import merged
 
 HELD_OUT = HoldOut(views=1, lights=1)
 AUTO = ("resampling.visibility=auto", "compression.fit=auto")

@@ -15,9 +15,9 @@ from reflfield.field.file import open_field
 from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.texels import texel_table
 from reflfield.geometry.uv_atlas import Atlas
-from reflfield.options import merged
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import STAGES
+from reflfield.util.nested_tables import merged
 
 # The tiny run leaves nothing open.
 # The tiny options ask for the clustered model, which keeps the hull.
