@@ -71,10 +71,11 @@ def kinds_of_stored(
         _upper_limit(stored[..., i], integer) if white_level is None else white_level
         for i in range(stored.shape[2])
     ]
-    kinds = np.where(stored < np.array(limits, np.float32), MEASURED, SATURATED)
+    kinds = np.full(stored.shape, MEASURED, np.uint8)  # a byte each: photographs are large
+    kinds[~(stored < np.array(limits, np.float32))] = SATURATED
     if integer:
         kinds[stored <= 0] = BLACK
-    return kinds.astype(np.uint8)
+    return kinds
 
 
 def kinds_of_bracket(shots: Sequence[Kinds], seconds: Sequence[float]) -> Kinds:

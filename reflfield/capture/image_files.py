@@ -141,8 +141,9 @@ def read_exposure(
         white = 1.0 if stored.integer else reading.white_level or 1.0
         share = image / np.float32(white)
         values = encode_srgb(share).astype(np.float32)
-        limited = np.select([share <= 0, share >= 1], [BLACK, SATURATED], MEASURED)
-        kinds = np.where(kinds == MEASURED, limited.astype(np.uint8), kinds)
+        measured, kinds = kinds == MEASURED, kinds.copy()
+        kinds[measured & (share <= 0)] = BLACK
+        kinds[measured & (share >= 1)] = SATURATED
         return values, kinds, Encoding(SRGB)
     return np.broadcast_to(stored.values, image.shape), kinds, space.encoding
 

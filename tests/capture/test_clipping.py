@@ -1,5 +1,7 @@
 """Which values of a photograph are measurements."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -102,3 +104,15 @@ def test_under_alpha_nothing_is_measured(tmp_path):
     _, kinds = capture_of(tmp_path, ("a.png", 1.0)).read_kinds(0)
     assert (kinds[:, :7] == TRANSPARENT).all()
     assert (kinds[:, 7:] == MEASURED).all()
+
+
+def test_kinds_of_large_photographs_take_a_few_bytes_a_value():
+    stored = np.linspace(0, 0.9, 3_000_000, dtype=np.float32).reshape(1000, 1000, 3)
+    tracemalloc.start()
+    try:
+        kinds_of_stored(stored, integer=True)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    # One of the result, three of conditions; as whole numbers of eight bytes it was nine.
+    assert peak < 5 * stored.size
