@@ -162,12 +162,8 @@ class Panel {
     layer.hidden = !photo;
     if (!photo) return;
     const { clientWidth: width, clientHeight: height } = viewer.canvas;
-    const scale = Math.min(width / photo.camera.width, height / photo.camera.height);
-    const size = [scale * photo.camera.width, scale * photo.camera.height];
-    Object.assign(layer.style, {
-      left: `${(width - size[0]) / 2}px`, top: `${(height - size[1]) / 2}px`,
-      width: `${size[0]}px`, height: `${size[1]}px`,
-    });
+    const box = fittedBox([photo.camera.width, photo.camera.height], viewer.free(width, height));
+    ["left", "top", "width", "height"].forEach((name, i) => { layer.style[name] = `${box[i]}px`; });
     const image = element("photograph-image"), share = Number(element("wipe").value);
     if (image.dataset.number !== String(viewer.scene.photo)) {
       image.src = this.pictures()[viewer.scene.photo];

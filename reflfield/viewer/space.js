@@ -84,10 +84,16 @@ function calibratedCamera(given, surface) {
   });
 }
 
-// The same camera with its image fitted into a window of another size.
-function fittedCamera(camera, width, height) {
-  const scale = Math.min(width / camera.width, height / camera.height);
-  const left = 0.5 * (width - scale * camera.width), top = 0.5 * (height - scale * camera.height);
+// Left, top, width and height of an image fitted into a part of a window.
+function fittedBox(size, free) {
+  const scale = Math.min(free[2] / size[0], free[3] / size[1]), [w, h] = times(size, scale);
+  return [free[0] + 0.5 * (free[2] - w), free[1] + 0.5 * (free[3] - h), w, h];
+}
+
+// The same camera with its image fitted into the free part of a window.
+function fittedCamera(camera, { width, height, free }) {
+  const [left, top, across] = fittedBox([camera.width, camera.height], free);
+  const scale = across / camera.width;
   return makeCamera({
     ...camera, width, height, focal: times(camera.focal, scale),
     centre: [left + scale * camera.centre[0], top + scale * camera.centre[1]],

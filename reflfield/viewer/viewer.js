@@ -88,11 +88,11 @@ class Viewer {
 
   // Camera of the scene for an image of some size.
   cameraFor(width, height) {
-    const photo = this.photo();
-    if (photo) return fittedCamera(calibratedCamera(photo.camera, this.surface), width, height);
-    const ratio = width / (this.canvas.clientWidth || width);
+    const ratio = width / (this.canvas.clientWidth || width), photo = this.photo();
     const free = this.free(width / ratio, height / ratio).map((value) => value * ratio);
-    return orbitCamera(this.scene.camera, this.frame, { width, height, free });
+    const place = { width, height, free };
+    if (photo) return fittedCamera(calibratedCamera(photo.camera, this.surface), place);
+    return orbitCamera(this.scene.camera, this.frame, place);
   }
 
   lampsOf(scene, camera, mapLights) {

@@ -169,8 +169,11 @@ class TestPanel:
         style = page.locator("#photograph-image").evaluate("e => e.style.clipPath")
         assert "75%" in style
         # The camera is the photograph's: the origin is drawn where it shows it.
-        camera = page.evaluate("reflfield.viewer().cameraFor(80, 60)")
-        assert camera["focal"] == pytest.approx([80 / 2 / np.tan(np.radians(15))] * 2)
+        camera = page.evaluate("reflfield.viewer().cameraFor(900, 620)")
+        assert camera["focal"] == pytest.approx([box["width"] / 2 / np.tan(np.radians(15))] * 2)
+        assert camera["centre"] == pytest.approx(
+            [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+        )
         drag(page, (200, 300), [(230, 320)])
         assert scene(page)["photo"] is None
         assert page.locator("#photograph").is_hidden()
