@@ -84,7 +84,7 @@ def decoded(block):
 
 
 def stored_vectors(path, attribute):
-    """An attribute of the only mesh of a glTF file, as it is stored: trimesh computes normals."""
+    """An attribute of the only mesh of a glTF file, as stored: trimesh computes normals."""
     content = path.read_bytes()
     (length,) = struct.unpack("<I", content[12:16])
     document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
