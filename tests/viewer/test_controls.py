@@ -4,6 +4,7 @@ import base64
 import io
 import re
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -57,6 +58,14 @@ def settled(page):
 
 def scene(page):
     return page.evaluate("reflfield.viewer().scene")
+
+
+def eventually(page, condition, seconds=20):
+    """Wait until a condition of the page holds; its policy forbids to evaluate text inside."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, condition
+        page.wait_for_timeout(20)
 
 
 def drag(page, start, steps, **options):
@@ -181,8 +190,7 @@ class TestPanel:
     def test_buttons(self, page):
         page.locator("#turntable").click()
         before = scene(page)["camera"]["azimuth"]
-        page.wait_for_timeout(600)
-        assert scene(page)["camera"]["azimuth"] > before
+        eventually(page, f"reflfield.viewer().scene.camera.azimuth > {before}")
         page.locator("#turntable").click()
         with page.expect_download() as download:
             page.locator("#save").click()
@@ -198,8 +206,7 @@ class TestPanel:
         page.locator("#reset").click()
         assert scene(page)["camera"]["azimuth"] == 0
         page.locator("#full").click()
-        settled(page)
-        assert page.evaluate("Boolean(document.fullscreenElement)")
+        eventually(page, "Boolean(document.fullscreenElement)")
         page.locator("#full").click()
 
 
