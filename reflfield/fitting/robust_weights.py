@@ -11,6 +11,8 @@ from reflfield.field.half_vector import FAST
 
 # Weighted residuals beyond these count in proportion (Huber): of coefficients, of tables.
 HUBER, TABLE_HUBER = np.float32(0.1), np.float32(0.15)
+# Added to values, so that black weighs what the slope of the sRGB curve is there, 12.92.
+DARKEST = np.float32(0.003)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
@@ -26,10 +28,10 @@ def is_evidence(value: Any, at_least: Any, predicted: Any) -> Any:
 def display_weight(value: Any) -> Any:
     """Weight of a residual at a value in units of white.
 
-    About the slope of the sRGB curve, flattened in the dark and falling above white.
+    About the slope of the sRGB curve, which is bounded in the dark, and falling above white.
     """
     y = max(value, np.float32(0.0))
-    weight = np.float32(0.45) / (y + np.float32(0.015)) ** np.float32(0.58)
+    weight = np.float32(0.45) / (y + DARKEST) ** np.float32(0.58)
     if y > np.float32(1.0):
         weight /= y ** np.float32(0.7)
     return weight

@@ -56,7 +56,7 @@ from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import plain
 from reflfield.pipeline.context import Context
-from reflfield.pipeline.memory import writers_at_once
+from reflfield.pipeline.memory import working_bytes, writers_at_once
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.progress import report
@@ -74,9 +74,9 @@ TANGENT_ROUNDS = 2
 WHITE_TEXELS, WHITE_QUANTILE = 1024, 0.995
 # Rows of pixels that tables are fitted to; each has several texels.
 PIXEL_ROWS = TABLE_ROWS // 2
-# Share of the memory for samples kept, for pixels, and for derivatives; what is larger goes to
-# files, but for pixels, of which then only some are fitted to.
-SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 8, 1 / 8, 1 / 4
+# Share of the working memory for samples kept, for pixels, and for derivatives; what is larger
+# goes to files, but for pixels, of which then only some are fitted to.
+SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 6, 1 / 6, 1 / 3
 # Pixels under a light that are fitted to at most: more would take hours.
 MOST_PIXELS = 32_000_000
 # Memory of a pixel under a light, and of a pixel with the texels under it.
@@ -141,7 +141,7 @@ class HalfVectorFit:
     def blocks(self, texels: Indices) -> SampleBlocks:
         """Samples of some texels in units of white."""
         parts = results.base_reader(self.context).blocks_of(texels)
-        budget = int(self.context.resources.max_memory * SAMPLES_SHARE)
+        budget = int(working_bytes(self.context) * SAMPLES_SHARE)
         white = self.white
         return SampleBlocks(lambda n: self._block(parts[n], white), len(parts), budget)
 
@@ -245,7 +245,7 @@ class HalfVectorFit:
         n_photographs = (training.photograph_index >= 0).sum(axis=1)
         n_values = int(np.dot(covered, n_photographs))
         n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
-        in_memory = self.context.resources.max_memory * PIXELS_SHARE
+        in_memory = working_bytes(self.context) * PIXELS_SHARE
         return min(1.0, MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
 
     def allocator(
@@ -254,7 +254,7 @@ class HalfVectorFit:
         """Maker of arrays for derivatives: in memory, or in files where they are too many."""
         shapes = [s for view in views for s in linearisation_shapes(view, n_lobes)]
         total = 4 * sum(int(np.prod(shape)) for shape in shapes)
-        if total <= self.context.resources.max_memory * DERIVATIVES_SHARE:
+        if total <= working_bytes(self.context) * DERIVATIVES_SHARE:
             return lambda shape: np.zeros(shape, np.float32)
         return partial(array_in_file, folder)
 

@@ -132,6 +132,17 @@ def columns_at_once(resources: Resources, n_pairs: int) -> int:
     return int(max(1, (resources.max_memory - BASE_BYTES) // (2 * columns_bytes(n_pairs))))
 
 
+def working_bytes(context: Context) -> int:
+    """Memory that a fit may fill, besides libraries, kernels and a photograph that is read.
+
+    A sixteenth of the ceiling at least: with less it would take for ever.
+    """
+    pixels = max(camera.width * camera.height for camera in context.training.cameras)
+    held = BASE_BYTES + COMPILED_BYTES + PHOTOGRAPH_BYTES * pixels
+    ceiling = context.resources.max_memory
+    return max(ceiling - held, ceiling // 16)
+
+
 def writers_at_once(context: Context) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
     n_texels, n_views, n_lights = (

