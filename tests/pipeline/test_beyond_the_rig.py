@@ -73,8 +73,8 @@ def test_no_texel_glows_or_is_black_under_lights_and_from_views_that_the_dome_la
     brightest = np.zeros(field.n_texels)
     np.maximum.at(brightest, texels, share)
     # 2.6 of the grid and, of one texel or two whose samples insist, 3.4 of the samples on one
-    # processor and 5.5 on another, whose sums differ in their last bits. The bound is 2.7 times the mean of the cluster, which as coarse a model keeps
-    # within a tenth of the truth.
+    # processor and 5.5 on another, whose sums differ in their last bits. The bound is 2.7 times
+    # the mean of the cluster, which as coarse a model keeps within a tenth of the truth.
     assert np.sort(brightest)[-3] < 4
     assert brightest.max() < 6.5
     assert (brightest > 2.7 * 1.1).mean() < 0.003
