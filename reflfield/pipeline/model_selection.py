@@ -30,8 +30,8 @@ SELECTION = "selection.json"
 CHANCE_DB = 1.0
 VISIBILITY, FIT = "resampling.visibility", "compression.fit"
 MODEL, LOBES = "compression.model", "compression.half_vector.n_lobes"
-# Samples of a texel, on average, that the half-vector model takes at least. Under 12 views and 12
-# lights there are ten: with them it shows a vase 4 dB better than clusters do, matt clay 1.5.
+# Samples of a texel, on average, that the half-vector model takes at least. Under 12 views and
+# 12 lights there are ten: with them it shows a vase 4 dB better than clusters do, clay 1.5.
 # Few views or few lights tell less of normals, and more samples are asked for.
 LEAST_HALF_VECTOR, LEAST_OF_FEW, FEW = 8, 64, 6
 
@@ -337,9 +337,8 @@ def sentences(context: Context) -> Iterator[str]:
         n = samples_per_texel(context)
         yield (
             f'{MODEL} = "auto" selected "{options.compression.model}": '
-            f"{n:.0f} samples per texel, "
-            f"the half-vector model takes {least_samples(context)} to {MOST_SAMPLES} of a solid "
-            "object under known lights."
+            f"{n:.0f} samples per texel, the half-vector model takes {least_samples(context)} "
+            f"to {MOST_SAMPLES} of a solid object under known lights."
         )
     errors = _lobe_errors(context)
     if errors:
