@@ -504,34 +504,10 @@ def say_metrics(metrics: dict[str, Any]) -> None:
         parts.append(f"without a pixel of the object: {', '.join(names)}")
     origins = ", ".join(f"{name} {n}" for name, n in measured["silhouettes"].items())
     say("; ".join([*parts, f"silhouettes: {origins}"]))
+    from reflfield.report.sections import analysis_lines
+
     for line in analysis_lines(metrics):
-        say(line)
-
-
-def analysis_lines(metrics: dict[str, Any]) -> Iterator[str]:
-    """What trivial methods get, a line each, and in which kinds of pixels most error lies."""
-    from reflfield.report.sections import BASELINE_NAMES, nearest_words
-
-    baselines = metrics.get("baselines", {"missing": {}})
-    for name, text in BASELINE_NAMES.items():
-        if name in baselines:
-            mean = baselines[name]["mean"]
-            more = f"; {nearest_words(baselines)}" if "nearest" in baselines[name] else ""
-            yield (
-                f"baseline {text}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), SSIM "
-                f"{mean['ssim']:.4f}, FLIP {mean['flip']:.4f}{more}"
-            )
-    for name, reason in baselines["missing"].items():
-        yield f"baseline {BASELINE_NAMES[name]}: none; {with_flags(reason)}"
-    kinds = metrics.get("error_kinds", {"kinds": {}})["kinds"]
-    ranked = sorted(kinds.items(), key=lambda kind: -kind[1]["share_of_squared_error"])[:3]
-    if ranked:
-        shares = (
-            f"{name} {kind['share_of_squared_error']:.0%} on {kind['share_of_pixels']:.0%} of "
-            "the pixels"
-            for name, kind in ranked
-        )
-        yield f"squared error: {', '.join(shares)}"
+        say(with_flags(line))
 
 
 if __name__ == "__main__":

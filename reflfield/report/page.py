@@ -273,8 +273,8 @@ def render_report(content: ReportContent) -> str:
         title=escape(content.title),
         subtitle=_paragraph(content.subtitle, "subtitle"),
         key_numbers=_key_numbers(content.key_numbers),
-        links=_link(content.object_page, "Turn the object and move the light"),
-        warnings=_warnings(content.warnings),
+        links=OBJECT_LINK.format(escape(content.object_page)) if content.object_page else "",
+        warnings="\n".join(_note(Note(t, is_warning=True)) for t in content.warnings),
         navigation=_navigation(content.sections, anchors),
         sections="\n".join(
             _section(s, a) for s, a in zip(content.sections, anchors, strict=True)
@@ -332,6 +332,8 @@ def format_seconds(seconds: float) -> str:
 
 # --- parts of the page ------------------------------------------------------------
 
+OBJECT_LINK = '<p class="link"><a href="{}">Turn the object and move the light</a></p>'
+
 
 def _anchors(titles: Sequence[str]) -> list[str]:
     """Distinct fragment names: made of safe characters only."""
@@ -351,18 +353,6 @@ def _key_numbers(numbers: Sequence[KeyNumber]) -> str:
         for n in numbers
     )
     return f'<dl class="key-numbers">\n{cards}\n</dl>' if cards else ""
-
-
-def _link(address: str, words: str) -> str:
-    return (
-        f'<p class="link"><a href="{escape(address)}">{escape(words)}</a></p>'
-        if address
-        else ""
-    )
-
-
-def _warnings(texts: Sequence[str]) -> str:
-    return "\n".join(_note(Note(text, is_warning=True)) for text in texts)
 
 
 def _navigation(sections: Sequence[Section], anchors: Sequence[str]) -> str:

@@ -13,11 +13,10 @@ from reflfield.report.sections.base_surface import (
     silhouettes_section,
 )
 from reflfield.report.sections.baseline_images import (
-    BASELINE_NAMES,
     AnalysedImage,
     AnalysedImages,
+    analysis_lines,
     analysis_sections,
-    nearest_words,
 )
 from reflfield.report.sections.candidate_runs import (
     CandidateRun,
@@ -45,7 +44,6 @@ from reflfield.report.sections.size_and_quality import (
 from reflfield.report.sections.truth_scores import truth_section
 
 __all__ = [
-    "BASELINE_NAMES",
     "AnalysedImage",
     "AnalysedImages",
     "CandidateRun",
@@ -56,6 +54,7 @@ __all__ = [
     "StageSummary",
     "ablation_section",
     "alignment_section",
+    "analysis_lines",
     "analysis_sections",
     "atlas_section",
     "bookkeeping_section",
@@ -66,7 +65,6 @@ __all__ = [
     "held_out_section",
     "key_numbers",
     "metrics_table",
-    "nearest_words",
     "normals_section",
     "rate_distortion_section",
     "rules_section",

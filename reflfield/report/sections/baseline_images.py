@@ -287,3 +287,27 @@ def _flat(coloured: NDArray[np.uint8], counted: NDArray[np.bool_]) -> Picture:
     """Colours that mean something, transparent where nothing is measured."""
     shown = pictures.fitted(pictures.with_alpha(coloured, counted), ROW_PX)
     return encode_picture(shown, lossless=True)
+
+
+def analysis_lines(metrics: Mapping[str, Any]) -> Iterator[str]:
+    """What trivial methods get, a line each, and in which kinds of pixels most error lies."""
+    baselines = metrics.get("baselines", {"missing": {}})
+    for name, text in BASELINE_NAMES.items():
+        if name in baselines:
+            mean = baselines[name]["mean"]
+            more = f"; {nearest_words(baselines)}" if "nearest" in baselines[name] else ""
+            yield (
+                f"baseline {text}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), SSIM "
+                f"{mean['ssim']:.4f}, FLIP {mean['flip']:.4f}{more}"
+            )
+    for name, reason in baselines["missing"].items():
+        yield f"baseline {BASELINE_NAMES[name]}: none; {reason}"
+    kinds = metrics.get("error_kinds", {"kinds": {}})["kinds"]
+    ranked = sorted(kinds.items(), key=lambda kind: -kind[1]["share_of_squared_error"])[:3]
+    if ranked:
+        shares = (
+            f"{name} {kind['share_of_squared_error']:.0%} on {kind['share_of_pixels']:.0%} of "
+            "the pixels"
+            for name, kind in ranked
+        )
+        yield f"squared error: {', '.join(shares)}"
