@@ -192,7 +192,7 @@ def run(
     """
     from reflfield.api.captures import open_capture
     from reflfield.api.reconstruction import read_options, reconstruct
-    from reflfield.options import parse_hold_out
+    from reflfield.options import parse_hold_out, size_settings
 
     started = time.perf_counter()
     options = read_options(config, [*(set_ or []), *size_settings(size, psnr)])
@@ -452,22 +452,6 @@ def n_workers(wanted: int) -> int:
             f"--workers: expected 1 to {MOST_WORKERS}, or 0 for one per core, received {wanted}"
         )
     return wanted or available_cores()
-
-
-def size_settings(size: str, psnr: float | None) -> list[str]:
-    """Settings of the size or quality that was asked for; neither asks for nothing."""
-    from reflfield.options import parse_bytes
-
-    settings = []
-    if size:
-        settings.append(f"compression.size={parse_bytes(size, 'size')}")
-        if settings[0].endswith("=0") or "-" in size:
-            raise InputError(f"--size: expected more than no bytes, received {size!r}")
-    if psnr is not None:
-        if not 0 < psnr < float("inf"):
-            raise InputError(f"--psnr: expected a number of dB above 0, received {psnr}")
-        settings.append(f"compression.psnr={psnr}")
-    return settings
 
 
 def say_results(result: Any, started: float) -> None:

@@ -438,3 +438,28 @@ def _hold_out_part(part: str) -> tuple[str, Any]:
     if name in ("views", "lights", "photographs") and re.fullmatch("[0-9]{1,9}", number):
         return name, int(number)
     return name, None
+
+
+def size_settings(size: str, psnr: float | None) -> list[str]:
+    """Settings of the size or quality that was asked for; neither asks for nothing.
+
+    Raises
+    ------
+    InputError
+        If one of them is not more than zero.
+
+    Examples
+    --------
+    >>> size_settings("500KB", None)
+    ['compression.size=512000']
+    """
+    settings = []
+    if size:
+        settings.append(f"compression.size={parse_bytes(size, 'size')}")
+        if settings[0].endswith("=0") or "-" in size:
+            raise InputError(f"size: expected more than no bytes, received {size!r}")
+    if psnr is not None:
+        if not 0 < psnr < float("inf"):
+            raise InputError(f"psnr: expected a number of dB above 0, received {psnr}")
+        settings.append(f"compression.psnr={psnr}")
+    return settings
