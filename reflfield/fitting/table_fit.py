@@ -36,7 +36,8 @@ Floats = NDArray[np.float32]
 
 # Rows are summed in so many parts, whatever the number of threads.
 PARTS = 8
-ITERATIONS = 15
+# Of conjugate gradients, in so many rounds between which the nodes at zero are told anew.
+ITERATIONS, ROUNDS = 15, 3
 # Smoothness of the lobes, relative to what the rows weigh; of the diffuse table.
 LOBE_SMOOTHNESS, DIFFUSE_SMOOTHNESS = 3e-4, 0.02
 # Nodes of neighbouring difference angles are tied more firmly than those of a layer.
@@ -229,11 +230,11 @@ def fit_tables(
         pool,
     )
     start = (np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1)), model.diffuse_table)
-    lobes, table = _conjugate_gradients(system, start, iterations)
+    lobes, table = _non_negative_solution(system, start, iterations)
     return normalised_tables(
         replace(
             model,
-            lobes=np.maximum(np.moveaxis(lobes, 1, 0), 0).astype(np.float32, order="C"),
+            lobes=np.moveaxis(lobes, 1, 0).astype(np.float32, order="C"),
             diffuse_table=np.maximum(table, LEAST_DIFFUSE).astype(np.float32),
         )
     )
@@ -298,30 +299,53 @@ def _linearised(
     return linearised
 
 
-def _conjugate_gradients(
+def _non_negative_solution(
     system: _TableSystem, start: tuple[Floats, Floats], iterations: int
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Some steps towards the solution, preconditioned by the diagonal."""
-    x = [part.astype(np.float64) for part in start]
-    diagonal = system.diagonal()
-    residual = [b - q for b, q in zip(system.right_side(), system.product(*x), strict=True)]
+    """Some steps towards the solution among non-negative tables.
+
+    Conjugate gradients over the nodes that are free: those above zero and those that the
+    gradient lifts; then the nodes below zero are put there, and the free ones told anew.
+    Clamped only at the end, a solution that swings below zero beside a highlight is far too
+    bright in the dark: its other nodes had balanced what is cut off.
+    """
+    x = [np.maximum(part, 0.0).astype(np.float64) for part in start]
+    diagonal, right = system.diagonal(), system.right_side()
+    for _ in range(ROUNDS):
+        gradient = [b - q for b, q in zip(right, system.product(*x), strict=True)]
+        free = [(a > 0) | (g > 0) for a, g in zip(x, gradient, strict=True)]
+        change = _conjugate_gradients(system, gradient, diagonal, free, iterations // ROUNDS)
+        x = [np.maximum(a + b, 0.0) for a, b in zip(x, change, strict=True)]
+    return x[0], x[1]
+
+
+def _conjugate_gradients(
+    system: _TableSystem,
+    gradient: list[NDArray[Any]],
+    diagonal: tuple[Any, Any],
+    free: list[NDArray[np.bool_]],
+    iterations: int,
+) -> list[NDArray[Any]]:
+    """Change of the free nodes after some steps from zero, preconditioned by the diagonal."""
+    change = [np.zeros_like(g) for g in gradient]
+    residual = [g * f for g, f in zip(gradient, free, strict=True)]
     scaled = [r / d for r, d in zip(residual, diagonal, strict=True)]
     direction = [z.copy() for z in scaled]
     energy = _dot(residual, scaled)
     for _ in range(iterations):
-        image = system.product(*direction)
+        image = [q * f for q, f in zip(system.product(*direction), free, strict=True)]
         curvature = _dot(direction, image)
         if not curvature > 0:
             break
         step = energy / curvature
-        x = [a + step * p for a, p in zip(x, direction, strict=True)]
+        change = [a + step * p for a, p in zip(change, direction, strict=True)]
         residual = [r - step * q for r, q in zip(residual, image, strict=True)]
         scaled = [r / d for r, d in zip(residual, diagonal, strict=True)]
         before, energy = energy, _dot(residual, scaled)
         if not energy > 0:
             break
         direction = [z + energy / before * p for z, p in zip(scaled, direction, strict=True)]
-    return x[0], x[1]
+    return change
 
 
 def _dot(a: Any, b: Any) -> float:
