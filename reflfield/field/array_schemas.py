@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.field.half_vector import DIFFUSE_NODES, LOBE_NODES
+from reflfield.field.half_vector import DIFFUSE_NODES, LOBE_NODES, SKEW_NODES
 
 _CODES = ("int8", "int16", "int32")
 
@@ -61,6 +61,8 @@ HALF_VECTOR_ARRAYS: Schema = {
     "lobe_weight_scale": (("float32",), ("n_lobes",)),
     "lobes": (_CODES, (LOBE_NODES, "n_lobes", 3)),
     "lobe_scale": (("float32",), ("n_lobes",)),
+    # Not in files of version 4, whose lobes have none.
+    "lobe_skews": (("int8",), ("n_lobes", SKEW_NODES, 3)),
     "diffuse_table": (("float32",), (DIFFUSE_NODES,)),
     **INDIRECT_ARRAYS,
 }

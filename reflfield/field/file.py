@@ -1,10 +1,10 @@
-"""The file of a reflectance field, `field.rfld`, version 4.
+"""The file of a reflectance field, `field.rfld`, version 5.
 
 A ZIP archive of `header.json` and one member for each array of the model's schema
 (`field.reflectance_field.SCHEMAS`), packed as `array_coding` describes. The header names
 format, version and model and, for each array, its dtype, shape, filter, context bits and the
-SHA-256 of its member. Version 3, which is read too, knows clustered fields only and names no
-model. Time stamps are fixed, so equal fields give equal bytes.
+SHA-256 of its member. Version 4, which is read too, knows no skews of lobes, and version 3 only
+clustered fields, and names no model. Time stamps are fixed, so equal fields give equal bytes.
 
 Opening reads the header alone; an array is read, and its checksum compared,
 when it is first used. Nothing is unpickled, nothing is extracted to disk, and
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from reflfield.errors import FieldFileError, InputError
 from reflfield.field.array_coding import FILTERS, pack, unpack
 from reflfield.field.array_schemas import SCHEMAS, Schema, check_arrays, node_side
+from reflfield.field.half_vector import SKEW_NODES
 from reflfield.field.reflectance_field import (
     ClusteredField,
     HalfVectorField,
@@ -47,8 +48,10 @@ from reflfield.field.stored_values import (
 from reflfield.util.files import check_regular, replacing
 
 FORMAT_NAME = "reflfield-field"
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 OLDEST_VERSION = 3
+
+SKEWS, FIRST_WITH_SKEWS = "lobe_skews", 5
 
 HEADER = "header.json"
 MAX_HEADER_BYTES = 16 << 20
@@ -154,7 +157,7 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
     path = Path(path)
     with _archive(path) as archive:
         header = _read_header(path, archive)
-        infos = _members(path, archive, SCHEMAS[header["model"]])
+        infos = _members(path, archive, _stored_schema(header))
         declared = _declared(path, header)
         if any(
             infos[member_name(name)].compress_type != zipfile.ZIP_STORED for name in declared
@@ -169,7 +172,7 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
             "be trusted"
         )
     with _naming(path):
-        return _field(header, StoredArrays(path, declared))
+        return _field(header, StoredArrays(path, declared, _without_skews(header, shapes)))
 
 
 @dataclass(frozen=True)
@@ -402,12 +405,31 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
             for name, entry in header["arrays"].items()
         }
         types = {n: (a.dtype, a.shape) for n, a in declared.items()}
-        check_lengths(check_arrays(types, header["model"]), SCHEMAS[header["model"]])
+        shapes = {n: shape for n, (_, shape) in types.items()}
+        absent = {n: (a.dtype.name, a.shape) for n, a in _without_skews(header, shapes).items()}
+        check_lengths(check_arrays(types | absent, header["model"]), SCHEMAS[header["model"]])
         for name, array in declared.items():
             if array.filter not in FILTERS:
                 raise ValueError(f"{name}: unknown filter {array.filter!r}")
         check_options(header["domain"], header["visibility"], header["light_model"])
     return declared
+
+
+def _stored_schema(header: Mapping[str, Any]) -> list[str]:
+    """Arrays that a file of this version holds."""
+    absent = () if header["version"] >= FIRST_WITH_SKEWS else (SKEWS,)
+    return [name for name in SCHEMAS[header["model"]] if name not in absent]
+
+
+def _without_skews(
+    header: Mapping[str, Any], shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, NDArray[Any]]:
+    """What a file of an earlier version lacks: skews, which are zero, by name."""
+    if SKEWS in _stored_schema(header) or SKEWS not in SCHEMAS[header["model"]]:
+        return {}
+    n_lobes = min(shapes.get("lobe_scale", (1,))[:1] or (1,))
+    skews = np.zeros((1, SKEW_NODES, 3), np.int8)
+    return {SKEWS: np.broadcast_to(skews, (n_lobes, *skews.shape[1:]))}
 
 
 def _length(value: Any) -> int:

@@ -17,7 +17,7 @@ from reflfield.field.build import (
     indirect_arrays,
     surface_arrays,
 )
-from reflfield.field.half_vector import HalfVectorModel
+from reflfield.field.half_vector import SKEW_STEP, HalfVectorModel
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.quantisation import check_finite, codes_from_rotations, smallest_codes
 from reflfield.field.reflectance_field import Domain, HalfVectorField, Visibility, check_options
@@ -66,7 +66,7 @@ def build_half_vector_field(
     InputError
         If a number is not finite or a frame is no rotation.
     """
-    for name in ("diffuse", "weights", "lobes", "diffuse_table"):
+    for name in ("diffuse", "weights", "lobes", "skews", "diffuse_table"):
         check_finite(name, getattr(model, name))
     bits = quantisation or Quantisation()
     arrays = surface_arrays(surface) | _model_arrays(model, bits)
@@ -107,6 +107,7 @@ def _model_arrays(model: HalfVectorModel, bits: Quantisation) -> dict[str, NDArr
         "lobe_weight_scale": weight_step.astype(np.float32),
         "lobes": _codes(np.rint(lobes / lobe_step.astype(np.float32)[:, None])),
         "lobe_scale": lobe_step.astype(np.float32),
+        "lobe_skews": np.rint(model.skews / SKEW_STEP).astype(np.int8),
         "diffuse_table": np.ascontiguousarray(model.diffuse_table, np.float32),
     }
 

@@ -38,6 +38,7 @@ from reflfield.errors import FieldFileError, InputError
 from reflfield.field.array_schemas import SCHEMAS, check_indices
 from reflfield.field.half_vector import (
     LEAST_COSINE,
+    SKEW_STEP,
     HalfVectorModel,
 )
 from reflfield.field.indirect_light import IndirectLight
@@ -392,14 +393,15 @@ class HalfVectorField(ReflectanceField):
             weights, lobes = (np.maximum(x, 0) ** 3 for x in (weights, lobes))
             peaks = lobes.max(axis=(1, 2), initial=0.0).astype(np.float64)
             most = (weights.max(axis=0, initial=0.0).astype(np.float64) * peaks).sum()
-            # The visibility factor is at most 1 over the least cosine.
-            bound = float(most / LEAST_COSINE + np.abs(diffuse).max(initial=0.0))
+            # The visibility factor is at most 1 over the least cosine, that of the skew 2.
+            bound = float(2 * most / LEAST_COSINE + np.abs(diffuse).max(initial=0.0))
         self._check_bound("diffuse, lobe_weights, lobes", bound, LARGEST_SAMPLE)
         return HalfVectorModel(
             frames=self.local_from_world,
             diffuse=diffuse.astype(np.float32),
             weights=weights.astype(np.float32),
             lobes=np.ascontiguousarray(lobes, np.float32),
+            skews=np.clip(self.arrays["lobe_skews"] * SKEW_STEP, -1, 1),
             diffuse_table=np.ascontiguousarray(self.arrays["diffuse_table"], np.float32),
         )
 

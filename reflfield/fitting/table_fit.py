@@ -18,14 +18,18 @@ from numpy.typing import NDArray
 from reflfield.field.half_vector import (
     DIFFUSE_NODES,
     HALF_SIDE,
+    LARGEST_SKEW,
     LOBE_NODES,
     N_DIFFERENCE,
     N_LIGHT,
     N_PHASE,
     N_VIEW,
+    SKEW_NODES,
+    SKEW_RINGS,
     HalfVectorModel,
 )
 from reflfield.fitting.table_kernels import (
+    add_skew_system,
     add_table_diagonal,
     add_table_product,
     add_table_right_side,
@@ -44,8 +48,10 @@ LOBE_SMOOTHNESS, DIFFUSE_SMOOTHNESS = 3e-4, 0.02
 ACROSS_LAYERS = 3.0
 # Least value of the diffuse table, whose mean is 1.
 LEAST_DIFFUSE = 0.02
-# Tie of every node to zero, relative to what a row weighs per node.
+# Tie of every node to zero, relative to what a row weighs per node; of a skew, and that of its
+# neighbouring nodes over it.
 RIDGE = 1e-6
+SKEW_TIE, SKEW_BENDING = 1e-4, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +100,21 @@ class _Linearised:
     lobe_share: Floats
     diffuse_node: NDArray[np.int32]
     diffuse_share: Floats
-    factor: Floats  # (n_entries, 2): of the diffuse part and of the lobes
+    ring_node: NDArray[np.int32]
+    ring_share: Floats  # (n_entries, 2): along the rings; cosine of twice the azimuth
+    spread: Floats  # (n_entries,): what lobes are multiplied by, but for their skew
+    factor: Floats  # (n_entries, 1 + 3 K): of the diffuse part, and of the lobes' channels
     weight: Floats  # (n_rows, 3): of the squared residual
+
+    @property
+    def taps(self) -> tuple[Any, Any, Any, Any]:
+        """Nodes and shares of lobes and diffuse table, as kernels take them."""
+        return self.lobe_node, self.lobe_share, self.diffuse_node, self.diffuse_share
+
+    @property
+    def rings(self) -> tuple[Any, Any, Any]:
+        """Places in the skews, and what they change, as kernels take them."""
+        return self.ring_node, self.ring_share, self.spread
 
 
 def _edges(shape: tuple[int, ...], strengths: tuple[float, ...]) -> tuple[Any, Any]:
@@ -112,6 +131,21 @@ def _edges(shape: tuple[int, ...], strengths: tuple[float, ...]) -> tuple[Any, A
 
 LOBE_EDGES, LOBE_TIES = _edges((N_DIFFERENCE, HALF_SIDE, HALF_SIDE), (ACROSS_LAYERS, 1.0, 1.0))
 DIFFUSE_EDGES, _ = _edges((N_PHASE, N_VIEW, N_LIGHT), (1.0, 1.0, 1.0))
+
+
+def _skew_prior() -> NDArray[np.float64]:
+    """Ties of a skew's nodes to zero and, more firmly, to each other."""
+    edges, _ = _edges((N_DIFFERENCE, SKEW_RINGS), (1.0, 1.0))
+    matrix = np.eye(SKEW_NODES)
+    for i, j in edges:
+        matrix[[i, j], [i, j]] += SKEW_BENDING
+        matrix[[i, j], [j, i]] -= SKEW_BENDING
+    return matrix
+
+
+SKEW_PRIOR = _skew_prior()
+# Where the half vector is the normal, or the difference angle is zero, there is no azimuth.
+FREE_SKEWS = np.outer(np.arange(N_DIFFERENCE) > 0, np.arange(SKEW_RINGS) > 0).ravel()
 
 
 def _laplacian(edges: NDArray[Any], ties: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
@@ -154,10 +188,9 @@ class _TableSystem:
 
     def _arguments(self, part: slice) -> tuple[Any, ...]:
         of, rows = self.linearised, self.linearised.rows
-        taps = (of.lobe_node, of.lobe_share, of.diffuse_node, of.diffuse_share)
         first = rows.first[part.start : part.stop + 1]
         coefficients = (self.model.diffuse, self.model.weights)
-        return first, rows.texel, taps, of.factor, of.weight[part], coefficients
+        return first, rows.texel, of.taps, of.factor, of.weight[part], coefficients
 
     def right_side(self) -> tuple[Any, Any]:
         """A^T W y."""
@@ -199,7 +232,7 @@ def fit_tables(
     smoothness: float = LOBE_SMOOTHNESS,
     iterations: int = ITERATIONS,
 ) -> HalfVectorModel:
-    """Model with tables that fit the rows better, and normalised.
+    """Model with tables and skews that fit the rows better, and normalised.
 
     Parameters
     ----------
@@ -231,13 +264,47 @@ def fit_tables(
     )
     start = (np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1)), model.diffuse_table)
     lobes, table = _non_negative_solution(system, start, iterations)
+    tables = (lobes.astype(np.float32), np.maximum(table, LEAST_DIFFUSE).astype(np.float32))
     return normalised_tables(
         replace(
             model,
-            lobes=np.moveaxis(lobes, 1, 0).astype(np.float32, order="C"),
-            diffuse_table=np.maximum(table, LEAST_DIFFUSE).astype(np.float32),
+            lobes=np.ascontiguousarray(np.moveaxis(tables[0], 1, 0)),
+            skews=_skews(linearised, model, tables, pool),
+            diffuse_table=tables[1],
         )
     )
+
+
+def _skews(
+    linearised: _Linearised,
+    model: HalfVectorModel,
+    tables: tuple[Floats, Floats],
+    pool: ThreadPoolExecutor,
+) -> Floats:
+    """Skews (K, SKEW_NODES, 3) of lobes (LOBE_NODES, K, 3), by ridge regression."""
+    rows, n = linearised.rows, model.n_lobes * SKEW_NODES
+    coefficients = (model.diffuse, model.weights)
+
+    def one(part: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        out = np.zeros((3, n, n)), np.zeros((3, n))
+        add_skew_system(
+            rows.first[part.start : part.stop + 1],
+            *(rows.texel, linearised.taps, linearised.rings, linearised.factor),
+            (rows.values[part], linearised.weight[part]),
+            *(coefficients, tables, out),
+        )
+        return out
+
+    sums = list(pool.map(one, rows.parts()))
+    matrix, right = (np.sum([part[i] for part in sums], axis=0) for i in (0, 1))
+    free = np.tile(FREE_SKEWS, model.n_lobes)
+    prior = np.kron(np.eye(model.n_lobes), SKEW_PRIOR) * (SKEW_TIE * rows.n_rows / SKEW_NODES)
+    skews = np.zeros((3, n))
+    for c in range(3):
+        system = (matrix[c] + prior)[np.ix_(free, free)]
+        skews[c, free] = np.linalg.solve(system, right[c, free])
+    bounded = np.clip(skews.T, -LARGEST_SKEW, LARGEST_SKEW)
+    return np.ascontiguousarray(bounded.reshape(-1, SKEW_NODES, 3), np.float32)
 
 
 def normalised_tables(model: HalfVectorModel) -> HalfVectorModel:
@@ -279,12 +346,11 @@ def _linearised(
         lobe_share=np.zeros((n, 3), np.float32),
         diffuse_node=np.zeros(n, np.int32),
         diffuse_share=np.zeros((n, 3), np.float32),
-        factor=np.zeros((n, 2), np.float32),
+        ring_node=np.zeros(n, np.int32),
+        ring_share=np.zeros((n, 2), np.float32),
+        spread=np.zeros(n, np.float32),
+        factor=np.zeros((n, 1 + 3 * model.n_lobes), np.float32),
         weight=np.zeros((rows.n_rows, 3), np.float32),
-    )
-    taps = (
-        *(linearised.lobe_node, linearised.lobe_share),
-        *(linearised.diffuse_node, linearised.diffuse_share),
     )
 
     def one(part: slice) -> None:
@@ -292,7 +358,8 @@ def _linearised(
             rows.first[part.start : part.stop + 1],
             *(rows.texel, rows.share, rows.views, rows.lights),
             (rows.values[part], rows.at_least[part]),
-            *(model.arrays, taps, linearised.factor, linearised.weight[part]),
+            *(model.arrays, linearised.taps, linearised.rings),
+            *(linearised.factor, linearised.weight[part]),
         )
 
     list(pool.map(one, rows.parts()))

@@ -15,11 +15,21 @@ from reflfield.field.half_vector import (
     HALF_SIDE,
     N_LIGHT,
     N_VIEW,
+    SKEW_RINGS,
     diffuse_value,
     half_taps,
     lobe_values,
+    skewed,
 )
 from reflfield.fitting.robust_weights import TABLE_HUBER, is_evidence, squared_weight
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def _skew_factors(skews: Any, taps: Any, spread: Any, factor: Any) -> None:
+    """Factors of the lobes of an entry, channel by channel, after that of the diffuse part."""
+    for k in range(skews.shape[0]):
+        for c in range(3):
+            factor[1 + 3 * k + c] = spread * skewed(skews[k], taps, c)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -32,13 +42,15 @@ def linearise_rows(
     observed: Any,
     model: Any,
     taps: Any,
+    rings: Any,
     factor: Any,
     weight: Any,
 ) -> None:
     """Taps and factors of entries; weights from the residuals of the model as it is."""
     frames, diffuse, weights, lobes, table = model
     lobe_node, lobe_share, diffuse_node, diffuse_share = taps
-    part = np.zeros((lobes.shape[0], 3), np.float32)
+    ring_node, ring_share, spread_of = rings
+    part = np.zeros((weights.shape[1], 3), np.float32)
     shown = np.zeros(3, np.float32)
     values, at_least = observed
     for row in range(len(values)):
@@ -46,17 +58,18 @@ def linearise_rows(
         for e in range(first[row], first[row + 1]):
             t = texel[e]
             at_lobe, at_diffuse, cosine, spread = half_taps(frames[t], views[e], lights[e])
-            lobe_node[e], fx, fy, fd = at_lobe
+            lobe_node[e], fx, fy, fd, ring_node[e], ring_share[e, 0], ring_share[e, 1] = at_lobe
             lobe_share[e, 0], lobe_share[e, 1], lobe_share[e, 2] = fx, fy, fd
             diffuse_node[e], gl, gv, gp = at_diffuse
             diffuse_share[e, 0], diffuse_share[e, 1], diffuse_share[e, 2] = gl, gv, gp
             factor[e, 0] = share[e] * cosine
-            factor[e, 1] = share[e] * cosine * spread
+            spread_of[e] = share[e] * cosine * spread
+            _skew_factors(lobes[1], at_lobe, spread_of[e], factor[e])
             base = factor[e, 0] * diffuse_value(table, at_diffuse)
-            lobe_values(lobes, at_lobe, factor[e, 1], part)
+            lobe_values(lobes, at_lobe, spread_of[e], part)
             for c in range(3):
                 shown[c] += base * diffuse[t, c]
-                for k in range(lobes.shape[0]):
+                for k in range(weights.shape[1]):
                     shown[c] += weights[t, k] * part[k, c]
         for c in range(3):
             if is_evidence(values[row, c], at_least[row, c], shown[c]):
@@ -90,12 +103,11 @@ def _place_entry(e: int, taps: Any, factor: Any, corners: Any) -> None:
     _corners(lobe_node[e], lobe_share[e], HALF_SIDE, HALF_SIDE * HALF_SIDE, in_lobes)
     _corners(diffuse_node[e], diffuse_share[e], N_LIGHT, N_LIGHT * N_VIEW, in_table)
     for m in range(8):
-        in_lobes[1][m] *= factor[e, 1]
         in_table[1][m] *= factor[e, 0]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _add_entry(t: int, corners: Any, model: Any, tables: Any, out: Any) -> None:
+def _add_entry(t: int, corners: Any, factor: Any, model: Any, tables: Any, out: Any) -> None:
     """Add what an entry of texel t shows of tables to `out` (3,)."""
     (nodes, taps), (table_nodes, table_taps) = corners
     diffuse, weights = model
@@ -111,13 +123,15 @@ def _add_entry(t: int, corners: Any, model: Any, tables: Any, out: Any) -> None:
             red += taps[m] * lobes[nodes[m], k, 0]
             green += taps[m] * lobes[nodes[m], k, 1]
             blue += taps[m] * lobes[nodes[m], k, 2]
-        out[0] += weights[t, k] * red
-        out[1] += weights[t, k] * green
-        out[2] += weights[t, k] * blue
+        out[0] += weights[t, k] * factor[1 + 3 * k] * red
+        out[1] += weights[t, k] * factor[2 + 3 * k] * green
+        out[2] += weights[t, k] * factor[3 + 3 * k] * blue
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _spread_entry(t: int, corners: Any, model: Any, residual: Any, out: Any) -> None:
+def _spread_entry(
+    t: int, corners: Any, factor: Any, model: Any, residual: Any, out: Any
+) -> None:
     """Adjoint of `_add_entry`: add a residual (3,) to tables."""
     (nodes, taps), (table_nodes, table_taps) = corners
     diffuse, weights = model
@@ -129,7 +143,9 @@ def _spread_entry(t: int, corners: Any, model: Any, residual: Any, out: Any) -> 
         table_out[table_nodes[m]] += table_taps[m] * base
     for k in range(lobes_out.shape[1]):
         weight = weights[t, k]
-        red, green, blue = weight * residual[0], weight * residual[1], weight * residual[2]
+        red = weight * factor[1 + 3 * k] * residual[0]
+        green = weight * factor[2 + 3 * k] * residual[1]
+        blue = weight * factor[3 + 3 * k] * residual[2]
         for m in range(8):
             lobes_out[nodes[m], k, 0] += taps[m] * red
             lobes_out[nodes[m], k, 1] += taps[m] * green
@@ -162,13 +178,13 @@ def add_table_product(
         shown[:] = np.float32(0.0)
         for e in range(first[row], first[row + 1]):
             _place_entry(e, taps, factor, corners)
-            _add_entry(texel[e], corners, model, tables, shown)
+            _add_entry(texel[e], corners, factor[e], model, tables, shown)
         for c in range(3):
             shown[c] *= weight[row, c]
         for e in range(first[row], first[row + 1]):
             if first[row + 1] - first[row] > 1:
                 _place_entry(e, taps, factor, corners)
-            _spread_entry(texel[e], corners, model, shown, out)
+            _spread_entry(texel[e], corners, factor[e], model, shown, out)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -191,7 +207,7 @@ def add_table_right_side(
                 shown[c] = weight[row, c] * values[row, c]
         for e in range(first[row], first[row + 1]):
             _place_entry(e, taps, factor, corners)
-            _spread_entry(texel[e], corners, model, shown, out)
+            _spread_entry(texel[e], corners, factor[e], model, shown, out)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -215,4 +231,90 @@ def add_table_diagonal(
                 for k in range(lobes_out.shape[1]):
                     scale = (shares[m] * weights[t, k]) ** 2
                     for c in range(3):
-                        lobes_out[nodes[m], k, c] += scale * weight[row, c]
+                        w = weight[row, c] * factor[e, 1 + 3 * k + c] ** 2
+                        lobes_out[nodes[m], k, c] += scale * w
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def _lobe_parts(t: int, corners: Any, spread: Any, model: Any, tables: Any, parts: Any) -> None:
+    """What an entry of texel t shows of each lobe but for its skew, into `parts` (K, 3)."""
+    nodes, shares = corners[0]
+    weights, lobes = model[1], tables[0]
+    for k in range(lobes.shape[1]):
+        for c in range(3):
+            total = np.float32(0.0)
+            for m in range(8):
+                total += shares[m] * lobes[nodes[m], k, c]
+            parts[k, c] = spread * weights[t, k] * total
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def _add_diffuse(t: int, corners: Any, model: Any, tables: Any, out: Any) -> None:
+    """Add what an entry of texel t shows of the diffuse table to `out` (3,)."""
+    nodes, shares = corners[1]
+    base = np.float32(0.0)
+    for m in range(8):
+        base += shares[m] * tables[1][nodes[m]]
+    for c in range(3):
+        out[c] += base * model[0][t, c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def _add_rings(ring: Any, share: Any, fd: Any, parts: Any, line: Any) -> None:
+    """Add derivatives of a row by the skews, through one entry, to `line` (K, nodes, 3)."""
+    fr, turn = share[0], share[1]
+    for m in range(4):
+        w = (fr if m & 1 else 1 - fr) * (fd if m & 2 else 1 - fd) * turn
+        node = ring + (m & 1) + (m >> 1) * SKEW_RINGS
+        for k in range(parts.shape[0]):
+            for c in range(3):
+                line[k, node, c] += w * parts[k, c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def _add_square(line: Any, c: int, weight: Any, residual: Any, matrix: Any, right: Any) -> None:
+    """Add one channel of a row to its normal equations; most of `line` (n, 3) is zero."""
+    for x in range(len(line)):
+        scaled = weight * line[x, c]
+        if scaled != 0.0:
+            right[x] += scaled * residual
+            for y in range(len(line)):
+                matrix[x, y] += scaled * line[y, c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def add_skew_system(
+    first: Any,
+    texel: Any,
+    taps: Any,
+    rings: Any,
+    factor: Any,
+    observed: Any,
+    model: Any,
+    tables: Any,
+    out: Any,
+) -> None:
+    """Add the normal equations of the skews, one system for each channel, to `out`.
+
+    `out` is the matrices (3, n, n) and right sides (3, n) of n = K * SKEW_NODES unknowns.
+    """
+    ring_node, ring_share, spread = rings
+    values, weight = observed
+    n_lobes, n = model[1].shape[1], out[1].shape[1]
+    line, corners = np.zeros((n_lobes, n // n_lobes, 3)), _empty_corners()
+    flat = line.reshape((n, 3))
+    shown, parts = np.zeros(3, np.float32), np.zeros((n_lobes, 3), np.float32)
+    for row in range(len(weight)):
+        shown[:] = np.float32(0.0)
+        line[:] = 0.0
+        for e in range(first[row], first[row + 1]):
+            _place_entry(e, taps, factor, corners)
+            _lobe_parts(texel[e], corners, spread[e], model, tables, parts)
+            _add_diffuse(texel[e], corners, model, tables, shown)
+            for c in range(3):
+                shown[c] += parts[:, c].sum()
+            _add_rings(ring_node[e], ring_share[e], taps[1][e, 2], parts, line)
+        for c in range(3):
+            if weight[row, c] > 0:
+                residual = values[row, c] - shown[c]
+                _add_square(flat, c, weight[row, c], residual, out[0][c], out[1][c])

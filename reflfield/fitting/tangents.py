@@ -43,7 +43,7 @@ def _moments(block: Any, texels: Any, model: Any, best: int, out: Any) -> None:
     """Normal equations (3 of the matrix, 2 of the right side) of each texel's two numbers."""
     first, view, light, values, views, lights = block
     frames, diffuse, weights, lobes, table = model
-    part = np.zeros((lobes.shape[0], 3), np.float32)
+    part = np.zeros((weights.shape[1], 3), np.float32)
     for row in range(len(texels)):
         t = texels[row]
         frame = frames[t]
@@ -65,7 +65,7 @@ def _moments(block: Any, texels: Any, model: Any, best: int, out: Any) -> None:
                 if np.isnan(values[s, c]):
                     continue
                 shown = diffuse[t, c] * base
-                for k in range(lobes.shape[0]):
+                for k in range(weights.shape[1]):
                     shown += weights[t, k] * part[k, c]
                 lobe = weights[t, best] * part[best, c]
                 factor = squared_weight(values[s, c], shown, HUBER) * lobe

@@ -15,6 +15,7 @@ from reflfield.field.half_vector import (
     DIFFUSE_NODES,
     FAST,
     N_DIFFERENCE,
+    SKEW_NODES,
     HalfVectorModel,
     diffuse_value,
     half_angles,
@@ -141,7 +142,7 @@ def _sums_of_texel(
     """Normal equations of one texel's coefficients; weighted squares and their number."""
     first, view, light, values, views, lights = block
     frames, diffuse, weights, lobes, table = model
-    n_lobes, error, count = lobes.shape[0], 0.0, 0
+    n_lobes, error, count = weights.shape[1], 0.0, 0
     for s in range(first[row], first[row + 1]):
         at_lobe, at_diffuse, cosine, spread = half_taps(
             frames[texel], views[row, view[s]], lights[row, light[s]]
@@ -205,7 +206,7 @@ def _solve_texels(
     block: Any, texels: Any, model: Any, centre: Any, tie: float, out: Any
 ) -> Any:
     """Coefficients (n, 3 + K) of texels; the weighted squared error before, and its count."""
-    n_lobes = model[3].shape[0]
+    n_lobes = model[2].shape[1]
     part = np.zeros((n_lobes, 3), np.float32)
     normal, right = np.zeros((3 + n_lobes, 3 + n_lobes)), np.zeros(3 + n_lobes)
     error, count = 0.0, 0
@@ -280,6 +281,7 @@ def start_model(frames: Floats, n_lobes: int) -> HalfVectorModel:
         diffuse=np.zeros((n, 3), np.float32),
         weights=np.ones((n, n_lobes), np.float32),
         lobes=np.repeat(lobes[..., None], 3, axis=2).astype(np.float32),
+        skews=np.zeros((n_lobes, SKEW_NODES, 3), np.float32),
         diffuse_table=np.ones(DIFFUSE_NODES, np.float32),
     )
 

@@ -361,8 +361,8 @@ def check_lights(context: Context) -> None:
 
 def arrays_of(model: HalfVectorModel) -> dict[str, NDArray[Any]]:
     """Arrays of a model by name."""
-    names = ("frames", "diffuse", "weights", "lobes", "diffuse_table")
-    return dict(zip(names, model.arrays, strict=True))
+    names = ("frames", "diffuse", "weights", "lobes", "skews", "diffuse_table")
+    return {name: getattr(model, name) for name in names}
 
 
 def write_model(path: Path, model: HalfVectorModel, white: float) -> None:

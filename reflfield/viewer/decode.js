@@ -165,6 +165,7 @@ function decodedHalfVector(arrays) {
     diffuse: diffuse.map((value) => value / unit),
     weights: weights.map((value, i) => value * peaks[i % nLobes] / unit),
     lobes: lobes.map((value, i) => value / (peaks[Math.floor(i / 3) % nLobes] || 1)),
+    skews: Float32Array.from(arrays.lobe_skews, (code) => code / 127),
     strongest: strongest / unit,
   };
 }

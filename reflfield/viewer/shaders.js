@@ -47,6 +47,7 @@ const float KNEE = radians(4.0);
 const float REACH = asinh(radians(90.0) / KNEE);
 const float LEAST = 0.05;
 uniform sampler3D u_lobes;       // 33 x 33 nodes of h, 6 of the difference angle for each lobe
+uniform sampler2DArray u_skews;  // 6 rings of the half vector, 6 of the difference angle
 uniform sampler3D u_diffuse;     // cosines of light and view, phase
 vec3 model_sample(ivec2 p, vec3 v, vec3 l) {
   float cosine = softened_cosine(l.z);
@@ -58,6 +59,9 @@ vec3 model_sample(ivec2 p, vec3 v, vec3 l) {
   vec2 square = h.xy * radius / (length(h.xy) + 1e-12);
   vec2 at = (clamp((square + 1.0) * 16.0, 0.0, 32.0) + 0.5) / 33.0;
   float layer = clamp(acos(cos_difference) * (5.0 / radians(90.0)), 0.0, 5.0) + 0.5;
+  vec2 ring = vec2(radius * 5.0 + 0.5, layer) / 6.0;
+  float sines = dot(h.xy, h.xy) * (1.0 - cos_difference * cos_difference);
+  float turn = min((l.z - v.z) * (l.z - v.z) / (2.0 * sines + 1e-12) - 1.0, 1.0);
   float cos_light = clamp(l.z, 0.0, 1.0), cos_view = clamp(v.z, LEAST, 1.0);
   vec3 node = vec3(cos_light * 5.0, cos_view * 5.0, (1.0 - cos_difference) * 3.0) + 0.5;
   float base = texture(u_diffuse, node / vec3(6.0, 6.0, 4.0)).r;
@@ -67,7 +71,8 @@ vec3 model_sample(ivec2 p, vec3 v, vec3 l) {
   vec3 lobes = vec3(0.0);
   for (int k = 0; k < N_LOBES; k++) {
     float z = (float(6 * k) + layer) / float(6 * N_LOBES);
-    lobes += weights[k] * texture(u_lobes, vec3(at, z)).rgb;
+    vec3 skew = 1.0 + turn * texture(u_skews, vec3(ring, float(k))).rgb;
+    lobes += weights[k] * skew * texture(u_lobes, vec3(at, z)).rgb;
   }
   return cosine * (texelFetch(u_texels, ivec3(p, 0), 0).rgb * base + spread * lobes);
 }

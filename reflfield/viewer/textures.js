@@ -135,6 +135,7 @@ function fieldTextures(gl, header, field) {
     both.set(weights.values, diffuse.values.length);
     add("u_texels", gl.TEXTURE_2D_ARRAY, [...diffuse.size.slice(0, 2), 2], both, half);
     add("u_lobes", gl.TEXTURE_3D, [33, 33, 6 * nLobes], lobeVolume(model.lobes, nLobes), smooth);
+    add("u_skews", gl.TEXTURE_2D_ARRAY, [6, 6, nLobes], rgbaOf(model.skews), smooth);
     add("u_diffuse", gl.TEXTURE_3D, [6, 6, 4], model.table,
       { internal: gl.R16F, format: gl.RED, linear: true });
     const most = [0, 1, 2].map((k) => largest(model.weights.filter((_, i) => i % nLobes === k)));

@@ -22,6 +22,8 @@ from reflfield.field.half_vector import (
     N_LIGHT,
     N_PHASE,
     N_VIEW,
+    SKEW_NODES,
+    SKEW_RINGS,
     HalfVectorModel,
 )
 from reflfield.field.half_vector_build import build_half_vector_field
@@ -48,6 +50,7 @@ def model():
         diffuse=rng.uniform(0, 1, (N_TEXELS, 3)).astype(np.float32),
         weights=rng.uniform(0, 1, (N_TEXELS, 2)).astype(np.float32),
         lobes=rng.uniform(0, 1, (2, LOBE_NODES, 3)).astype(np.float32),
+        skews=rng.uniform(-0.9, 0.9, (2, SKEW_NODES, 3)).astype(np.float32),
         diffuse_table=rng.uniform(0.5, 1.5, DIFFUSE_NODES).astype(np.float32),
     )
 
@@ -86,9 +89,27 @@ def reference(model, texels, views, lights):
     base = RegularGridInterpolator(grid, table)(np.stack([1 - cos_d, cos_v, cos_l], axis=1))
     raised = np.maximum(cos_l, 0.05)
     spread = 1 / (raised + cos_v - raised * cos_v)
-    shine = sum(model.weights[texels, k, None] * lobe for k, lobe in enumerate(lobes))
+    shine = sum(
+        model.weights[texels, k, None] * lobe * skewed(model.skews[k], half, light)
+        for k, lobe in enumerate(lobes)
+    )
     value = model.diffuse[texels] * base[:, None] + spread[:, None] * shine
     return softened_cosine(light[:, 2])[:, None] * value
+
+
+def skewed(skew, half, light):
+    """Factor of a lobe by the azimuth of the light about the half vector, (n, 3)."""
+    normal = np.array([0.0, 0, 1])
+    up = normal - half * half[:, 2:]
+    across = np.cross(half, up)
+    azimuth = np.arctan2((light * across).sum(axis=1), (light * up).sum(axis=1))
+    angles = [np.arccos(np.clip(x, 0, 1)) for x in ((light * half).sum(axis=1), half[:, 2])]
+    knee = np.radians(4.0)
+    ring = np.arcsinh(angles[1] / knee) / np.arcsinh(np.pi / 2 / knee)
+    grid = (np.linspace(0, np.pi / 2, N_DIFFERENCE), np.linspace(0, 1, SKEW_RINGS))
+    at = np.stack([angles[0], ring], axis=1)
+    table = skew.astype(np.float64).reshape(N_DIFFERENCE, SKEW_RINGS, 3)
+    return 1 + np.cos(2 * azimuth)[:, None] * RegularGridInterpolator(grid, table)(at)
 
 
 def pairs(n=400):
@@ -194,3 +215,27 @@ def test_an_unknown_model_is_refused(model, tmp_path):
     with_header(tmp_path / "new.rfld", tmp_path / "other.rfld", model="splines")
     with pytest.raises(FieldFileError, match="model: expected one of"):
         open_field(tmp_path / "other.rfld")
+
+
+def test_files_of_version_4_have_lobes_without_skews(model, tmp_path):
+    write_field(tmp_path / "new.rfld", built(model))
+    header = json.loads(zipfile.ZipFile(tmp_path / "new.rfld").read(HEADER))
+    arrays = {n: entry for n, entry in header["arrays"].items() if n != "lobe_skews"}
+    with_header(tmp_path / "new.rfld", tmp_path / "all.rfld", version=4, arrays=arrays)
+    with (
+        zipfile.ZipFile(tmp_path / "all.rfld") as old,
+        zipfile.ZipFile(tmp_path / "old.rfld", "w") as new,
+    ):
+        for info in old.infolist():
+            if info.filename != "lobe_skews.bin":
+                new.writestr(info, old.read(info))
+    opened = open_field(tmp_path / "old.rfld")
+    texels, views, lights = pairs(50)
+    without = built(replace(model, skews=np.zeros_like(model.skews)))
+    np.testing.assert_array_equal(
+        evaluate(opened, texels, views, lights), evaluate(without, texels, views, lights)
+    )
+    # A file of the present version must have them.
+    with_header(tmp_path / "old.rfld", tmp_path / "cut.rfld", version=5)
+    with pytest.raises(FieldFileError):
+        open_field(tmp_path / "cut.rfld")

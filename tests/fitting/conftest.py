@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from reflfield.field.half_vector import DIFFUSE_NODES, LOBE_NODES, HalfVectorModel
+from reflfield.field.half_vector import DIFFUSE_NODES, LOBE_NODES, SKEW_NODES, HalfVectorModel
+from reflfield.fitting.table_fit import FREE_SKEWS
 
 
 def unit(rng, *shape):
@@ -21,12 +22,20 @@ def frames_about(rng, n, tilt=0.2):
     return np.stack([tangent, np.cross(normal, tangent), normal], axis=1).astype(np.float32)
 
 
+def random_skews(rng, n_lobes, size=0.5):
+    """Skews that are zero where there is no azimuth, as those that are fitted."""
+    skews = rng.uniform(-size, size, (n_lobes, SKEW_NODES, 3)).astype(np.float32)
+    skews[:, ~FREE_SKEWS] = 0
+    return skews
+
+
 def random_model(rng, n=5, n_lobes=2):
     return HalfVectorModel(
         frames=frames_about(rng, n),
         diffuse=rng.uniform(0.1, 1.0, (n, 3)).astype(np.float32),
         weights=rng.uniform(0.1, 1.0, (n, n_lobes)).astype(np.float32),
         lobes=rng.uniform(0.0, 1.0, (n_lobes, LOBE_NODES, 3)).astype(np.float32),
+        skews=random_skews(rng, n_lobes),
         diffuse_table=rng.uniform(0.5, 1.5, DIFFUSE_NODES).astype(np.float32),
     )
 

@@ -10,11 +10,18 @@ from reflfield.field.half_vector import (
     DIFFUSE_NODES,
     LOBE_NODES,
     N_DIFFERENCE,
+    SKEW_NODES,
+    SKEW_RINGS,
     evaluate_half_vector,
     half_angles,
 )
 from reflfield.fitting import table_fit
-from reflfield.fitting.table_fit import TableRows, fit_tables, normalised_tables
+from reflfield.fitting.table_fit import (
+    FREE_SKEWS,
+    TableRows,
+    fit_tables,
+    normalised_tables,
+)
 from tests.fitting.conftest import random_model, unit
 
 
@@ -178,3 +185,86 @@ def test_entries_of_one_row_are_corners_of_their_own(small_rng):
         one, two = (system_of(model, r, pool).product(lobes, table) for r in (together, twice))
     for a, b in zip(one, two, strict=True):
         np.testing.assert_allclose(b, a, atol=1e-5 * np.abs(a).max())
+
+
+def skewed_truth(rng, n_lobes=2):
+    """Gaussian lobes of two widths on one texel, skewed; rows of single samples."""
+    angle = half_angles().ravel()
+    lobes = [np.exp(-((angle / np.radians(w)) ** 2)) for w in (40.0, 20.0)[:n_lobes]]
+    of_layers = np.tile(np.stack(lobes), (1, N_DIFFERENCE))[..., None]
+    model = replace(
+        random_model(rng, n=8, n_lobes=n_lobes),
+        lobes=np.repeat(of_layers, 3, axis=2).astype(np.float32),
+        diffuse_table=np.ones(DIFFUSE_NODES, np.float32),
+    )
+    skews = np.zeros_like(model.skews)
+    skews[:, FREE_SKEWS] = np.array([-0.6, 0.0, 0.3], np.float32)
+    return normalised_tables(replace(model, skews=skews))
+
+
+def test_planted_skews_are_recovered(small_rng, monkeypatch):
+    monkeypatch.setattr(table_fit, "SKEW_TIE", 1e-6)
+    truth = skewed_truth(small_rng, 1)
+    rows = random_rows(small_rng, truth, 30_000, per_row=1)
+    begin = replace(truth, skews=np.zeros_like(truth.skews))
+    errors = []
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(7):
+            errors.append(np.sqrt(np.mean((shown(begin, rows) - rows.values) ** 2)))
+            begin = fit_tables(rows, begin, pool, smoothness=1e-6)
+    assert errors[-1] < 0.05 * errors[0]
+    # Nodes that rows are about: neither near the axis nor where lights graze.
+    skew = begin.skews[0].reshape(N_DIFFERENCE, SKEW_RINGS, 3)[1:4, 2:5]
+    np.testing.assert_allclose(skew, np.broadcast_to([-0.6, 0.0, 0.3], skew.shape), atol=0.05)
+    assert not begin.skews[:, ~FREE_SKEWS].any()
+
+
+def test_the_equations_of_skews_are_those_of_a_dense_least_squares(small_rng):
+    model = random_model(small_rng, n=6)
+    rows = random_rows(small_rng, replace(model, diffuse=model.diffuse * 1.1), 300)
+    n = model.n_lobes * SKEW_NODES
+    unskewed = replace(model, skews=np.zeros_like(model.skews))
+    at_zero, columns = shown(unskewed, rows), np.zeros((rows.n_rows, n, 3))
+    for x in range(n):
+        skews = np.zeros((n, 3), np.float32)
+        skews[x] = 1
+        one = replace(model, skews=skews.reshape(model.skews.shape))
+        columns[:, x] = shown(one, rows) - at_zero
+    with ThreadPoolExecutor(1) as pool:
+        linearised = table_fit._linearised(rows, model, pool)
+        lobes = np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1))
+        found = table_fit._skews(linearised, model, (lobes, model.diffuse_table), pool)
+    free = np.tile(FREE_SKEWS, model.n_lobes)
+    prior = np.kron(np.eye(model.n_lobes), table_fit.SKEW_PRIOR)
+    prior *= table_fit.SKEW_TIE * rows.n_rows / SKEW_NODES
+    for c in range(3):
+        a, w = columns[:, free, c], linearised.weight[:, c].astype(np.float64)
+        matrix = a.T @ (w[:, None] * a) + prior[np.ix_(free, free)]
+        right = a.T @ (w * (rows.values - at_zero)[:, c])
+        exact = np.clip(np.linalg.solve(matrix, right), -0.95, 0.95)
+        # Differences of singles make the columns here, over a system of condition 1e4 or less.
+        assert np.linalg.cond(matrix) < 1e4
+        np.testing.assert_allclose(found.reshape(n, 3)[free, c], exact, atol=5e-3)
+
+
+def test_a_narrow_highlight_does_not_lift_the_dark(small_rng):
+    """The dark is fitted to what it is, though the nodes beside the peak would swing below."""
+    angle = half_angles().ravel()
+    peak = 20 * np.exp(-((angle / np.radians(3.0)) ** 2)) + 1e-4
+    truth = random_model(small_rng, n=4, n_lobes=1)
+    truth = replace(
+        truth,
+        diffuse=np.full_like(truth.diffuse, 1e-4),
+        weights=np.ones_like(truth.weights),
+        lobes=np.tile(peak, (1, N_DIFFERENCE))[..., None].repeat(3, 2).astype(np.float32),
+        skews=np.zeros_like(truth.skews),
+    )
+    rows = random_rows(small_rng, truth, 20_000, per_row=1)
+    begin = replace(truth, lobes=np.full_like(truth.lobes, 0.05))
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(4):
+            begin = fit_tables(rows, begin, pool)
+    dark = rows.values.mean(axis=1) < 1e-3
+    assert dark.mean() > 0.3
+    lifted = shown(begin, rows)[dark].mean() / rows.values[dark].mean()
+    assert lifted < 2.0

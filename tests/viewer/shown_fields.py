@@ -8,6 +8,7 @@ from reflfield.field.build import BaseSurface, FittedReflectance, build_field
 from reflfield.field.half_vector import (
     DIFFUSE_NODES,
     N_DIFFERENCE,
+    SKEW_NODES,
     HalfVectorModel,
     half_angles,
 )
@@ -68,6 +69,7 @@ def half_vector_field(visibility: str = "factored", name: str = "spheres"):
         diffuse=(0.3 * varying(surface, 3)).astype(np.float32),
         weights=varying(surface, 2).astype(np.float32),
         lobes=lobes.astype(np.float32),
+        skews=rng.uniform(-0.9, 0.9, (2, SKEW_NODES, 3)).astype(np.float32),
         diffuse_table=rng.uniform(0.8, 1.2, DIFFUSE_NODES).astype(np.float32),
     )
     return build_half_vector_field(
