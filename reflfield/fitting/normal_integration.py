@@ -3,14 +3,14 @@ r"""A surface from normals: displacements of texels along the normals of the hul
 Displacements x minimise
 
 .. math:: \sum_{ij} w_{ij} \rho\Big(\frac{(p_i - p_j) \cdot n_{ij}}{\ell_{ij}}\Big)
-          + \frac{1}{e^2} \sum_i (\lambda + \lambda_a a_i) x_i^2
+          + \frac{1}{e^2} \sum_i (\lambda + \lambda_a a_i + \lambda_o [x_i > 0]) x_i^2
           + \frac{\mu}{e^2} \|L x\|^2,
 
 :math:`p_i = q_i + x_i g_i` the moved texels, g the hull's normals, :math:`n_{ij}` the mean of
 the fitted normals of two neighbours, :math:`\ell_{ij}` their distance, e its mean, L the
 graph's Laplacian, :math:`\rho` Huber's function. Anchors a are near 1 where a silhouette
 touches the hull and the fitted normal is perpendicular to its ray: there the hull lies on the
-object.
+object. Nowhere does it lie inside of it, so that moves outwards are tied firmly.
 
 References
 ----------
@@ -36,10 +36,11 @@ from reflfield.geometry.silhouette_distance import SignedDistance
 
 Array = NDArray[np.float64]
 
-# Ties of a texel to the hull, of an anchored one besides, and of neighbours' displacements.
-TIE, ANCHOR_TIE, SMOOTHNESS = 0.05, 0.05, 0.02
+# Ties of a texel to the hull, of an anchored one besides and of one that would move outwards,
+# and of neighbours' displacements.
+TIE, ANCHOR_TIE, OUTWARD_TIE, SMOOTHNESS = 0.002, 0.05, 0.1, 0.02
 # Slopes beyond this count in proportion, found in so many rounds.
-HUBER, ROUNDS = 0.1, 3
+HUBER, ROUNDS = 0.1, 4
 # Cosine between normal and ray, and distance of the outline in pixels, at which an anchor has
 # fallen to 1/e; farther outlines than the last anchor nothing.
 ANCHOR_COSINE, ANCHOR_PIXELS, FARTHEST_PIXELS = 0.05, 0.5, 0.75
@@ -141,18 +142,16 @@ def integrated_displacements(fitted: FittedNormals, graph: TexelGraph, anchors: 
     i, j = graph.pairs.T
     weight = np.minimum(fitted.confidence[i], fitted.confidence[j])
     bending = graph.laplacian()
-    ties = csr_array(
-        diags_array((TIE + ANCHOR_TIE * anchors) / edge**2)
-        + bending @ bending * (SMOOTHNESS / edge**2)
-    )
+    smooth = csr_array(bending @ bending * (SMOOTHNESS / edge**2))
     x = np.zeros(len(fitted.positions))
     for _ in range(ROUNDS):
+        tie = (TIE + ANCHOR_TIE * anchors + OUTWARD_TIE * (x > 0)) / edge**2
         size = np.abs(slopes @ x - target)
         robust = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
-        matrix = csr_array(slopes.T @ diags_array(robust) @ slopes + ties)
+        matrix = csr_array(slopes.T @ diags_array(robust) @ slopes + smooth + diags_array(tie))
         right = slopes.T @ (robust * target)
         scale = diags_array(1.0 / matrix.diagonal())
-        # Ties of a twentieth of what an edge weighs: some hundred steps at most.
+        # Ties of some thousandths of what an edge weighs: some hundred steps.
         x, _ = cg(matrix, right, x0=x, rtol=1e-6, maxiter=1000, M=scale)
     return np.asarray(x)
 
