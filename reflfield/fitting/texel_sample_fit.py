@@ -87,14 +87,16 @@ def sample_block(
     white : float
         What 1 stands for, 1/sr.
     """
-    t, i, j = np.nonzero(samples.seen & reliable[:, None])
+    t, photograph = np.nonzero(
+        samples.pairs.both(samples.view_seen, samples.light_seen & reliable)
+    )
     factor = np.float32(samples.unit / white)
     return SampleBlock(
         texels=texels,
         first=np.searchsorted(t, np.arange(len(texels) + 1)).astype(np.int64),
-        view=i.astype(np.int16),
-        light=j.astype(np.int16),
-        values=samples.samples[t, i, j].astype(np.float32) * factor,
+        view=samples.pairs.view[photograph].astype(np.int16),
+        light=samples.pairs.light[photograph].astype(np.int16),
+        values=samples.samples[t, photograph].astype(np.float32) * factor,
         views=samples.views,
         lights=samples.lights,
     )

@@ -427,7 +427,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     write_field(folder / "field.rfld", made)
     write_model(folder / MODEL, model, fit.white)
     size = (folder / "field.rfld").stat().st_size
-    raw = int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 6
+    raw = results.base_reader(context).store.raw_bytes()
     error = sample_error(made, results.base_reader(context), results.measured_texels(context))
     counted = results.base_reader(context).count_fitted(
         np.flatnonzero(results.sampled(context).any(axis=1))
