@@ -77,8 +77,9 @@ PIXEL_ROWS = TABLE_ROWS // 2
 # Share of the working memory for samples kept, for pixels, and for derivatives; what is larger
 # goes to files, but for pixels, of which then only some are fitted to.
 SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 6, 1 / 6, 1 / 3
-# Pixels under a light that are fitted to at most: more would take hours.
-MOST_PIXELS = 32_000_000
+# Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
+# would take hours, or minutes.
+MOST_PIXELS, MOST_FOOTPRINTS = 32_000_000, 1_500_000
 # Memory of a pixel under a light, and of a pixel with the texels under it.
 VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 # In the folder of the stage.
@@ -246,7 +247,8 @@ class HalfVectorFit:
         n_values = int(np.dot(covered, n_photographs))
         n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
         in_memory = working_bytes(self.context) * PIXELS_SHARE
-        return min(1.0, MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
+        of_values = min(MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
+        return min(1.0, of_values, MOST_FOOTPRINTS / max(sum(covered), 1))
 
     def allocator(
         self, views: Sequence[ViewPixels], n_lobes: int, folder: Path

@@ -47,6 +47,7 @@ def block_of(rng, model, texels=None, views=None, lights=None):
         values=values,
         views=views,
         lights=lights,
+        camera=view.astype(np.int16),
     )
 
 
@@ -66,6 +67,7 @@ def without_samples(block, row):
         view=block.view[kept],
         light=block.light[kept],
         values=block.values[kept],
+        camera=block.camera[kept],
     )
 
 
