@@ -75,6 +75,12 @@ class SampleBlock:
         arrays = (self.view, self.light, self.values, self.views, self.lights, self.camera)
         return sum(array.nbytes for array in arrays)
 
+    def light_angles(self) -> Floats:
+        """Angle (n_samples,) between view and light of each sample, radians."""
+        row = np.repeat(np.arange(len(self.texels)), np.diff(self.first))
+        views, lights = self.views[row, self.view], self.lights[row, self.light]
+        return np.arccos(np.clip(np.einsum("nd,nd->n", views, lights), -1.0, 1.0))
+
 
 def sample_block(
     texels: Indices, samples: TexelSamples, reliable: NDArray[np.bool_], white: float

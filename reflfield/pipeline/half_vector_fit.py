@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -54,7 +54,7 @@ from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
-from reflfield.pipeline.cache import plain
+from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import working_bytes, writers_at_once
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
@@ -72,6 +72,9 @@ LOBE_TEXELS, USUAL_LOBES = 1024, 3
 TANGENT_ROUNDS = 2
 # Texels and quantile of their samples' luminance that is taken for white.
 WHITE_TEXELS, WHITE_QUANTILE = 1024, 0.995
+# Quantiles between which samples show how light comes in beside the view; light is from all
+# sides where they reach farther than so many degrees.
+ANGLE_QUANTILES, ALL_SIDES = (0.01, 0.99), 60.0
 # Rows of pixels that tables are fitted to; each has several texels.
 PIXEL_ROWS = TABLE_ROWS // 2
 # Share of the working memory for samples kept, for pixels, and for derivatives; what is larger
@@ -134,6 +137,15 @@ class HalfVectorFit:
         luminance = luminance[np.isfinite(luminance)]
         white = float(np.quantile(luminance, WHITE_QUANTILE)) if len(luminance) else 0.0
         return white if white > 0 else 1.0
+
+    @cached_property
+    def light_angles(self) -> tuple[float, float]:
+        """Angles between view and light within which nearly all samples lie, degrees."""
+        some = results.random_texels(self.context, WHITE_TEXELS)
+        parts = results.base_reader(self.context).blocks_of(some)
+        angles = np.concatenate([self._block(part, 1.0).light_angles() for part in parts])
+        low, high = np.quantile(angles, ANGLE_QUANTILES) if len(angles) else (0.0, np.pi)
+        return float(np.degrees(low)), float(np.degrees(high))
 
     def _block(self, texels: Indices, white: float) -> SampleBlock:
         samples = results.base_reader(self.context).measured(texels)
@@ -451,4 +463,23 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "relative error of their cube roots": error.cube_root,
         "LDR PSNR of the samples, dB": error.psnr_ldr,
         "samples measured": error.n_samples,
+        WARNINGS: list(beside_the_view(*fit.light_angles)),
     }
+
+
+def beside_the_view(low: float, high: float) -> Iterator[str]:
+    """Say it where all light came from near the cameras; angles in degrees.
+
+    Examples
+    --------
+    >>> list(beside_the_view(2.0, 150.0))
+    []
+    >>> next(beside_the_view(9.6, 9.8)).partition(";")[0]
+    'all light comes from 10 to 10 degrees beside the view'
+    """
+    if high < ALL_SIDES:
+        yield (
+            f"all light comes from {low:.0f} to {high:.0f} degrees beside the view; under "
+            "light from elsewhere the field shows what it continues those samples to, and no "
+            "more is known; photograph with lights apart from the camera, too"
+        )
