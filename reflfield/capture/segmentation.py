@@ -1,8 +1,9 @@
 """Silhouettes made from photographs, where none are given.
 
 A backdrop shows at the border of the image. Where the border is of one colour (black cloth,
-a lit wall), the object is what differs from it; otherwise OpenCV's GrabCut separates what
-the border shows from the rest. Both work on the mean of a view's photographs: a part in
+a lit wall), the object is what differs from a smooth surface fitted to the backdrop, which a
+flash lights unevenly; otherwise OpenCV's GrabCut separates what the border shows from the rest.
+Both work on the mean of a view's photographs: a part in
 shadow under one light is lit under another, and noise averages out.
 
 A silhouette that misses part of the object carves that part off the hull for good, one that
@@ -40,8 +41,18 @@ CRACK = 0.02
 # Notches in the outline up to this width are filled: mostly parts in cast shadow, as dark as
 # the backdrop. Holes are left as they are.
 CLOSING = 0.036
+# The backdrop is a polynomial of this degree in the place, fitted to an image with at most this
+# longer side, degree after degree, without what strays by more than so many standard deviations
+# from the one before.
+BACKDROP_DEGREE, BACKDROP_SIZE, BACKDROP_OUTLIER = 4, 128, 4.0
+# The backdrop strays from that by less than its variation in this share of its pixels; the
+# rest may be the object.
+BACKDROP_SHARE = 0.95
+# Differences from the backdrop, over its variation, of what is certainly object and of what
+# belongs to it if it is near.
+STRONG, WEAK = 3.5, 1.75
 # Parts and holes with a smaller share of the object's area are removed and filled.
-SMALLEST_PART = 0.05
+SMALLEST_PART = 0.005
 SMALLEST_HOLE = 0.015
 # Width of the band beside the outline in which coverage may lie between 0 and 1.
 SOFT_EDGE = 0.003
@@ -91,7 +102,7 @@ def silhouette_from_photographs(
     difference = np.abs(encoded - backdrop).max(axis=2)
     uniform = np.quantile(difference[border], 0.75) < UNIFORM_SPREAD
     if uniform:
-        inside = _differs_from_backdrop(difference, border)
+        inside = _differs_from_backdrop(encoded, difference)
     else:
         inside = _grabcut(encoded, border)
     seen, inside = inside, _cleaned(inside)
@@ -138,34 +149,73 @@ def _border(height: int, width: int, fraction: float) -> Bool:
     return border
 
 
-def _differs_from_backdrop(difference: Float32, border: Bool) -> Bool:
+def _differs_from_backdrop(encoded: Float32, difference: Float32) -> Bool:
     """Pixels that differ from the backdrop, or differ a little and are near such ones.
 
     Both thresholds follow what the backdrop itself varies by; the upper one is at most
-    Otsu's, which splits the image's two levels.
+    Otsu's, which splits the two levels of the difference from the border's colour. What touches
+    the border of the image must be brighter than that somewhere: the backdrop goes on there.
     """
-    n = max(3, round(MARGIN * max(difference.shape)))
+    height, width = difference.shape
+    n = max(3, round(MARGIN * max(height, width)))
     levels = np.clip(difference * 255, 0, 255).astype(np.uint8)
     otsu = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0] / 255
-    bright = (difference > max(otsu, LEAST_CONTRAST)).astype(np.uint8)
-    far = cv2.dilate(bright, _disc(n)) == 0
-    variation = _variation(difference, border, far)
-    strong = float(np.clip(3 * variation, 2 * LEAST_CONTRAST, max(otsu, 0.1)))
-    weak = float(np.clip(1.25 * variation, LEAST_CONTRAST, 0.75 * strong))
-    smooth = cv2.GaussianBlur(difference, (0, 0), 0.7)
+    bright = difference > max(otsu, LEAST_CONTRAST)
+    far = cv2.dilate(bright.astype(np.uint8), _disc(n)) == 0
+    backdrop = _backdrop(encoded, far)
+    smooth = cv2.GaussianBlur(np.abs(encoded - backdrop).max(axis=2), (0, 0), 0.7)
+    border = _border(height, width, BORDER)
+    variation = min(_variation(smooth[border]), _variation(smooth[far]))
+    strong = float(np.clip(STRONG * variation, 2 * LEAST_CONTRAST, max(otsu, 0.1)))
+    weak = float(np.clip(WEAK * variation, LEAST_CONTRAST, 0.75 * strong))
     near = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
-    return _touching((smooth > weak) & near, smooth > strong)
+    inside = _touching((smooth > weak) & near, smooth > strong)
+    at_border = _touching(inside, _border(height, width, 0.0))
+    return (inside & ~at_border) | _touching(inside, bright)
 
 
-def _variation(difference: Float32, border: Bool, far: Bool) -> float:
-    """How far the backdrop strays from its median colour.
+def _variation(difference: Float32) -> float:
+    """How far the backdrop strays from its surface, as far as some pixels show it.
 
-    Seen far from the bright pixels, where dark parts of the object may hide, and in the
-    border, which the object may cross: the smaller of both, and the border is farther from
-    the light that the object scatters.
+    Far from bright pixels dark parts of the object may hide, and the object may cross the
+    border: the smaller of both.
     """
-    in_border = 2.5 * float(np.quantile(difference[border], 0.95)) + 1 / 255
-    return min(in_border, float(np.quantile(difference[far], 0.99)) if far.any() else 0.0)
+    if not len(difference):
+        return 0.0
+    return float(np.quantile(difference, BACKDROP_SHARE)) + 1 / 255
+
+
+def _backdrop(encoded: Float32, usable: Bool) -> Float32:
+    """Smooth backdrop (h, w, 3).
+
+    Parameters
+    ----------
+    encoded : (h, w, 3) float32
+    usable : (h, w) bool
+        Where no object is seen; may hold its dark parts.
+    """
+    height, width = usable.shape
+    scale = min(1.0, BACKDROP_SIZE / max(height, width))
+    size = (max(2, round(width * scale)), max(2, round(height * scale)))
+    small = cv2.resize(encoded, size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    kept = (
+        cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA).ravel() > 0.99
+    )
+    y, x = np.meshgrid(np.linspace(-1, 1, size[1]), np.linspace(-1, 1, size[0]), indexing="ij")
+    surface = np.broadcast_to(
+        np.median(small[kept], axis=0) if kept.any() else 0.0, small.shape
+    )
+    for degree in range(1, BACKDROP_DEGREE + 1):
+        error = np.abs(small - surface).max(axis=1)
+        deviation = 1.4826 * float(np.median(error[kept])) if kept.any() else 0.0
+        kept = error < max(BACKDROP_OUTLIER * deviation, 1 / 255)
+        powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+        if np.count_nonzero(kept) < 2 * len(powers):
+            break
+        terms = np.stack([x.ravel() ** i * y.ravel() ** j for i, j in powers], axis=1)
+        surface = terms @ np.linalg.lstsq(terms[kept], small[kept], rcond=None)[0]
+    shaped = surface.reshape(size[1], size[0], 3).astype(np.float32)
+    return cv2.resize(shaped, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:

@@ -266,13 +266,14 @@ def refined_frames(
     n_nodes = (reader.sides[0] ** 2, reader.sides[1] ** 2)
     check_shape("model.table", model.table, (None, *n_nodes, None))
     measured = reader.measured(texels)
-    samples = measured.samples.astype(np.float32) * np.float32(measured.unit)
+    unit = np.float32(measured.unit)
+    samples = measured.pairs.as_product(measured.samples.astype(np.float32) * unit, 0.0)
     frames = reader.local_from_world[texels].astype(np.float64)
     _refine(
         transform(samples, reader.options.domain),
         (measured.views.astype(np.float64), measured.lights.astype(np.float64)),
         (measured.view_seen, measured.light_seen),
-        measured.pairs,
+        measured.pairs.table,
         model.table,
         model.cluster[texels],
         model.coefficients[texels],

@@ -34,6 +34,7 @@ def compile_kernels() -> None:
         values=np.ones((2, 3), np.float32),
         views=up,
         lights=up,
+        camera=np.zeros(2, np.int16),
     )
     pixels = ViewPixels(
         texels=np.arange(2, dtype=np.int32),

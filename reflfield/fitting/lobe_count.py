@@ -59,7 +59,7 @@ def of_views(blocks: SampleBlocks, among: NDArray[np.bool_]) -> SampleBlocks:
 
     def read(number: int) -> SampleBlock:
         block = blocks[number]
-        kept = among[block.view]
+        kept = among[block.camera]
         before = np.concatenate([[0], np.cumsum(kept)])
         return replace(
             block,
@@ -67,6 +67,7 @@ def of_views(blocks: SampleBlocks, among: NDArray[np.bool_]) -> SampleBlocks:
             view=block.view[kept],
             light=block.light[kept],
             values=block.values[kept],
+            camera=block.camera[kept],
         )
 
     return SampleBlocks(read, blocks.n_blocks, blocks.budget)

@@ -52,10 +52,13 @@ class SampleBlock:
     first : (n + 1,) int64
         First sample of each texel.
     view, light : (n_samples,) int16
+        Places in `views` and `lights`.
     values : (n_samples, 3) float32
         NaN where not measured.
     views, lights : (n, k, 3) float32
         Unit directions of each texel, world frame.
+    camera : (n_samples,) int16
+        View of the capture.
     """
 
     texels: Indices
@@ -65,12 +68,19 @@ class SampleBlock:
     values: Floats
     views: Floats
     lights: Floats
+    camera: NDArray[np.int16]
 
     @property
     def n_bytes(self) -> int:
         """Memory."""
-        arrays = (self.view, self.light, self.values, self.views, self.lights)
+        arrays = (self.view, self.light, self.values, self.views, self.lights, self.camera)
         return sum(array.nbytes for array in arrays)
+
+    def light_angles(self) -> Floats:
+        """Angle (n_samples,) between view and light of each sample, radians."""
+        row = np.repeat(np.arange(len(self.texels)), np.diff(self.first))
+        views, lights = self.views[row, self.view], self.lights[row, self.light]
+        return np.arccos(np.clip(np.einsum("nd,nd->n", views, lights), -1.0, 1.0))
 
 
 def sample_block(
@@ -88,16 +98,31 @@ def sample_block(
     white : float
         What 1 stands for, 1/sr.
     """
-    t, i, j = np.nonzero(samples.seen & reliable[:, None])
+    pairs, lit = samples.pairs, samples.light_seen & reliable
+    t, photograph = np.nonzero(pairs.both(samples.view_seen, lit))
     factor = np.float32(samples.unit / white)
+    first = np.searchsorted(t, np.arange(len(texels) + 1)).astype(np.int64)
+    view, light = pairs.view[photograph], pairs.light[photograph]
+    place = np.arange(len(t)) - first[t]
+    n_most = int(place.max(initial=-1)) + 1
+    if 2 * n_most < pairs.n_views + pairs.n_lights:
+        # Of few photographs of many each sample has directions of its own.
+        places, views, lights = (
+            (place, place),
+            *np.zeros((2, len(texels), n_most, 3), np.float32),
+        )
+        views[t, place], lights[t, place] = samples.views[t, view], samples.lights[t, light]
+    else:
+        places, views, lights = (view, light), samples.views, samples.lights
     return SampleBlock(
         texels=texels,
-        first=np.searchsorted(t, np.arange(len(texels) + 1)).astype(np.int64),
-        view=i.astype(np.int16),
-        light=j.astype(np.int16),
-        values=samples.samples[t, i, j].astype(np.float32) * factor,
-        views=samples.views,
-        lights=samples.lights,
+        first=first,
+        view=places[0].astype(np.int16),
+        light=places[1].astype(np.int16),
+        values=samples.samples[t, photograph].astype(np.float32) * factor,
+        views=views,
+        lights=lights,
+        camera=view.astype(np.int16),
     )
 
 

@@ -134,11 +134,37 @@ class RayScene:
 
     def row_depths(self, camera: Camera, first: int, end: int) -> Array:
         """`pixel_depths` at the centres of all pixels of some rows, (end - first, width)."""
-        row, column = np.meshgrid(
-            np.arange(first, end) + 0.5, np.arange(camera.width) + 0.5, indexing="ij"
-        )
-        pixels = np.stack([column.ravel(), row.ravel()], axis=1)
-        return self.pixel_depths(camera, pixels).reshape(end - first, camera.width)
+        depth = np.full((end - first, camera.width), np.inf)
+        rows, columns = self._window(camera)
+        rows = range(max(rows.start, first), min(rows.stop, end))
+        if rows and columns:
+            row, column = np.meshgrid(
+                np.array(rows) + 0.5, np.array(columns) + 0.5, indexing="ij"
+            )
+            pixels = np.stack([column.ravel(), row.ravel()], axis=1)
+            inside = slice(rows.start - first, rows.stop - first)
+            depth[inside, columns.start : columns.stop] = self.pixel_depths(
+                camera, pixels
+            ).reshape(row.shape)
+        return depth
+
+    def _window(self, camera: Camera) -> tuple[range, range]:
+        """Rows and columns of a camera's image that may show the mesh.
+
+        Where straight lines stay straight a triangle lies between its corners.
+        """
+        whole = range(camera.height), range(camera.width)
+        if not camera.keeps_lines_straight:
+            return whole
+        pixels, depth = camera.project(self.mesh.vertices)
+        if camera.kind != "orthographic" and not (depth > 0.0).all():
+            return whole
+        size = (camera.width, camera.height)
+        # A pixel more, for rounding.
+        low = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, size).astype(int)
+        high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int)
+        columns, rows = (range(*ends) for ends in zip(low.tolist(), high.tolist(), strict=True))
+        return rows, columns
 
     def silhouette(self, camera: Camera) -> Bools:
         """True at the pixels of a camera whose centres show the mesh, (height, width)."""

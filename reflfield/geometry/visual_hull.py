@@ -61,6 +61,11 @@ _COLLAPSED = 0.1
 # Median share of the silhouettes on which views must agree for a hull to be of use.
 _HOPELESS = 0.5
 
+# Of so many silhouettes that were made from photographs one may miss a part of the object.
+MADE_VIEWS_PER_WRONG = 40
+# Median overlap of those with the hull from which they are taken to be of one object.
+_MADE_OVERLAP = 0.8
+
 # Fewer views than these do not outweigh one that says the object is larger.
 LEAST_WITNESSES = 6
 
@@ -77,7 +82,9 @@ class HullOptions:
         Views that may disagree at a point without carving it away. 0 is the hull proper;
         1 or 2 suit photographs whose silhouettes miss thin parts in single views, and
         make the hull fatter wherever that many views carry the shape alone. "auto" is 0,
-        but makes the hull without views that contradict all others, saying so.
+        but makes the hull without views that contradict all others, saying so; of many views
+        whose silhouettes were made from photographs, and may each miss a dark part, it is one
+        in `MADE_VIEWS_PER_WRONG`.
     blur : float
         Standard deviation, voxels, of a Gaussian over the signed distance. It removes the
         saw teeth of sharp ridges, which would cost decimation and charts dearly.
@@ -174,6 +181,7 @@ def visual_hull(
     options: HullOptions | None = None,
     *,
     scratch: Path | None = None,
+    made: bool = False,
 ) -> tuple[Mesh, HullReport]:
     """Watertight mesh of the visual hull, smoothed and decimated.
 
@@ -189,6 +197,8 @@ def visual_hull(
     scratch : Path, optional
         Folder in which the distances of large silhouettes are kept, 4 bytes for each pixel,
         instead of in memory. The hull is the same.
+    made : bool
+        Whether the silhouettes were made from photographs; see `HullOptions.tolerance`.
 
     Returns
     -------
@@ -213,8 +223,11 @@ def visual_hull(
     options = options or HullOptions()
     views = measured_views(cameras, silhouettes, scratch)
     views, silhouettes, specks = without_specks(views, silhouettes, scratch)
+    n_wrong = len(views) // MADE_VIEWS_PER_WRONG if made and options.tolerance == AUTO else 0
     with noting_small_parts(views):
-        outcome = _agreed_hull(views, silhouettes, options, scratch)
+        outcome = _hull_of_made(views, silhouettes, options, n_wrong) if n_wrong else None
+        if outcome is None:
+            outcome = _agreed_hull(views, silhouettes, options, scratch)
     grid, mesh = outcome.carved.grid, outcome.carved.mesh
     agreement = outcome.fit or _agreement(mesh, cameras, silhouettes)
     report = HullReport(
@@ -260,6 +273,21 @@ def _carved(views: Sequence[View], options: HullOptions, tolerance: int) -> _Car
     grid = Grid.around(low, high, options.resolution)
     volume, n_evaluated = carve(views, grid, tolerance)
     return _Carved(_surface(volume, grid, options, views), grid, n_evaluated)
+
+
+def _hull_of_made(
+    views: Sequence[View],
+    silhouettes: Sequence[NDArray[np.floating]],
+    options: HullOptions,
+    n_wrong: int,
+) -> _Outcome | None:
+    """Hull that so many views may undercut; None where the silhouettes hardly agree with it."""
+    try:
+        carved = _carved(views, options, n_wrong)
+    except GeometryError:
+        return None
+    fit = _agreement(carved.mesh, [view.camera for view in views], silhouettes)
+    return _Outcome(carved, fit=fit) if np.median(fit.overlap) > _MADE_OVERLAP else None
 
 
 def _agreed_hull(

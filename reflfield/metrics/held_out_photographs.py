@@ -110,9 +110,9 @@ def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:
 
     Parameters
     ----------
-    values : (n, n_views, n_lights, 3) float
+    values : (n, n_photographs, 3) float
         NaN where a channel was not measured.
-    observed : (n, n_views, n_lights) bool
+    observed : (n, n_photographs) bool
 
     Returns
     -------
@@ -120,6 +120,6 @@ def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:
     """
     measured = ~np.isnan(values)
     counted = observed.astype(np.float32)
-    weight = np.einsum("nvlc,nvl->nc", measured.astype(np.float32), counted)
-    total = np.einsum("nvlc,nvl->nc", np.where(measured, values, 0).astype(np.float32), counted)
+    weight = np.einsum("npc,np->nc", measured.astype(np.float32), counted)
+    total = np.einsum("npc,np->nc", np.where(measured, values, 0).astype(np.float32), counted)
     return total / np.where(weight > 0, weight, np.nan)

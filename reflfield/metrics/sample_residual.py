@@ -100,10 +100,11 @@ def _radiances(
     Values that were not measured are NaN.
     """
     measured = reader.measured(texels)
-    t, i, j = np.nonzero(measured.seen)
+    t, photograph = np.nonzero(measured.seen)
+    i, j = measured.pairs.view[photograph], measured.pairs.light[photograph]
     irradiance = facing_irradiance(reader.capture.lights, reader.positions[texels])
     return (
-        measured.samples[t, i, j].astype(np.float32) * np.float32(measured.unit),
+        measured.samples[t, photograph].astype(np.float32) * np.float32(measured.unit),
         evaluate(field, texels[t], measured.views[t, i], measured.lights[t, j]),
         irradiance[t, j],
     )

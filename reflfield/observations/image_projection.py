@@ -1,9 +1,10 @@
-"""Photographs into texture space: one apparent BRDF sample per texel, view and light."""
+"""Photographs into texture space: one apparent BRDF sample per texel and photograph."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -14,6 +15,7 @@ from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import BLACK
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
     UNIT,
     Location,
@@ -150,16 +152,15 @@ class Projection:
         check_shape("positions", self.positions, (None, 3))
         check_shape("visible", self.visible, (len(self.positions), self.capture.n_views))
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Texels, views and lights."""
-        return len(self.positions), self.capture.n_views, self.capture.n_lights
+    @cached_property
+    def pairs(self) -> PhotographedPairs:
+        """View and light of each photograph, in the order of the store."""
+        return PhotographedPairs.of(self.capture)
 
-    def views_of_chunks(self) -> list[range]:
-        """Views whose samples are written together."""
-        step = chunk_shape(*self.shape)[1]
-        n_views = self.capture.n_views
-        return [range(i, min(i + step, n_views)) for i in range(0, n_views, step)]
+    def chunks(self) -> list[range]:
+        """Places of the photographs whose samples are written together."""
+        n, step = len(self.pairs), chunk_shape(len(self.positions), self.pairs)[1]
+        return [range(i, min(i + step, n)) for i in range(0, n, step)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,57 +254,63 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
     unit of the samples.
     """
     first = LookedInto(**blocks.once("first", lambda: vars(look_into(projection))))
-    create_samples(projection.location, *projection.shape, sample_unit(first))
+    n_texels, pairs = len(projection.positions), projection.pairs
+    create_samples(projection.location, n_texels, pairs, sample_unit(first))
     parts = blocks.map(
         "projecting photographs",
-        project_views,
+        project_chunk,
         projection,
-        projection.views_of_chunks(),
-        intact=has_views,
+        projection.chunks(),
+        intact=has_chunk,
         at_once=at_once,
     )
-    n_photographs, values, brightest, darkest = 0, [], 0.0, 0.0
-    measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
+    n_photographs, brightest, darkest = 0, 0.0, 0.0
+    values = np.zeros((pairs.n_views, len(VALUE_KINDS)), np.int64)
+    measured = np.zeros((n_texels, -(-pairs.n_lights // 8)), np.uint8)
     for part in parts:
         n_photographs += int(part["photographs"])
-        values.append(part["values"])
+        values[part["views"]] += part["values"]
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
         darkest = min(darkest, float(part["darkest"]))
-    bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
-    projected = Projected(
-        n_photographs, np.concatenate(values), bits, brightest, darkest, first
-    )
+    bits = np.unpackbits(measured, axis=1, count=pairs.n_lights).astype(np.bool_)
+    projected = Projected(n_photographs, values, bits, brightest, darkest, first)
     n_gaps = sum(projected.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(projected.values.sum()), 1))
     return projected
 
 
-def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any]]:
-    """Write the samples of a few views; gives the number of photographs read, and of values."""
+def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArray[Any]]:
+    """Write the samples of a few photographs; gives their number and that of their values."""
     points = np.asarray(projection.positions, np.float64)
-    n_lights = projection.capture.n_lights
-    block = np.zeros((len(points), len(views), n_lights, 3), np.float16)
-    counts = np.zeros((len(views), len(VALUE_KINDS)), np.int64)
-    measured = np.zeros((len(points), n_lights), np.bool_)
+    views, lights = (
+        of_pairs[photographs.start : photographs.stop]
+        for of_pairs in (projection.pairs.view, projection.pairs.light)
+    )
+    block = np.zeros((len(points), len(photographs), 3), np.float16)
+    of_block, starts = np.unique(views, return_index=True)
+    counts = np.zeros((len(of_block), len(VALUE_KINDS)), np.int64)
+    measured = np.zeros((len(points), projection.pairs.n_lights), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
-    n_read, brightest, darkest = 0, 0.0, 0.0
-    for i, view in enumerate(views):
+    brightest, darkest = 0.0, 0.0
+    for i, (view, first, end) in enumerate(
+        zip(of_block, starts, np.append(starts[1:], len(views)), strict=True)
+    ):
         seen = np.flatnonzero(projection.visible[:, view])
-        for lights, values, kinds in _view_samples(
-            projection.capture, view, points[seen], projection.budget
+        for some, values, kinds in _view_samples(
+            projection.capture, int(view), lights[first:end], points[seen], projection.budget
         ):
             stored = np.clip(values / np.float32(unit), -HALF_MAX, HALF_MAX)
-            block[seen[:, None], i, lights] = stored.astype(np.float16)
+            block[seen[:, None], first + some] = stored.astype(np.float16)
             counts[i] += _counts_of(kinds)
-            measured[seen[:, None], lights] |= IS_KNOWN[kinds].any(axis=2)
-            n_read += len(lights)
+            measured[seen[:, None], lights[first + some]] |= IS_KNOWN[kinds].any(axis=2)
             brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
             darkest = min(darkest, float(np.fmin.reduce(values, axis=None, initial=0.0)))
-    store[:, views.start : views.stop] = block
+    store[:, photographs.start : photographs.stop] = block
     return {
-        "photographs": np.array(n_read),
+        "photographs": np.array(len(photographs)),
+        "views": of_block,
         "values": counts,
         "measured": np.packbits(measured, axis=1),
         "brightest": np.array(brightest),
@@ -318,10 +325,10 @@ def _counts_of(kinds: Kinds) -> NDArray[np.int64]:
     return np.array([kinds.size] + [0] * (len(VALUE_KINDS) - 1), np.int64)
 
 
-def has_views(projection: Projection, views: range) -> bool:
-    """Whether the store holds the samples of some views, whole."""
+def has_chunk(projection: Projection, photographs: range) -> bool:
+    """Whether the store holds the samples of some photographs, whole."""
     store = open_samples(projection.location)
-    return is_written(store, (slice(None), slice(views.start, views.stop)))
+    return is_written(store, (slice(None), slice(photographs.start, photographs.stop)))
 
 
 def look_into(projection: Projection) -> LookedInto:
@@ -382,18 +389,20 @@ def sample_unit(looked_into: LookedInto) -> float:
 
 
 def _view_samples(
-    capture: Capture, view: int, points: NDArray[np.float64], budget: int
+    capture: Capture,
+    view: int,
+    lights: NDArray[np.intp],
+    points: NDArray[np.float64],
+    budget: int,
 ) -> Iterator[tuple[NDArray[np.intp], Floats, Kinds]]:
-    """Samples and kinds (n_points, n, 3) of one view, some lights at a time."""
+    """Places of some lights at a time, with samples and kinds (n_points, n, 3) of a view."""
     pixels, _ = capture.cameras[view].project(points)
-    photographed = np.flatnonzero(capture.photograph_index[view] >= 0)
     camera = capture.cameras[view]
     # A photograph with the copies made of it while reading, and its samples.
     each = 12 * (3 * camera.width * camera.height + 4 * len(points))
     together = int(np.clip(budget // max(each, 1), 1, LIGHTS_AT_ONCE))
-    for lights in np.array_split(photographed, max(1, -(-len(photographed) // together))):
-        if len(lights):
-            yield lights, *_samples_at(capture, view, lights, points, pixels)
+    for some in np.array_split(np.arange(len(lights)), -(-len(lights) // together)):
+        yield some, *_samples_at(capture, view, lights[some], points, pixels)
 
 
 def _samples_at(
@@ -483,8 +492,3 @@ def directions_of(
     views = np.stack([camera.view_directions(points) for camera in capture.cameras], axis=1)
     lights = np.stack([light.directions(points) for light in capture.lights], axis=1)
     return views.astype(np.float32), lights.astype(np.float32)
-
-
-def pairs_photographed(capture: Capture) -> NDArray[np.bool_]:
-    """(n_views, n_lights) True where a photograph exists."""
-    return capture.photograph_index >= 0

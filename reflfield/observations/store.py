@@ -1,11 +1,12 @@
-"""Apparent BRDF samples of all texels on disk, written by views, read by texels.
+"""Apparent BRDF samples of all texels on disk, written by photographs, read by texels.
 
-A store is one zarr array of shape (n_texels, n_views, n_lights, 3), half floats, in chunks
-of some texels and some views, in a folder or in object storage. Chunks are written whole or
-not at all and carry a CRC-32C. Which samples count follows from three small arrays beside
-it: the views and lights that each texel sees, and the pairs that were photographed. Of a
-sample that counts, a value that was not measured is NaN: the light has none of that colour, or
-the pixel was saturated. What no writer has written is minus infinity, which no sample is.
+A store is one zarr array of shape (n_texels, n_photographs, 3), half floats, in chunks of some
+texels and some photographs, in a folder or in object storage. Photographs are ordered by view,
+then light (`PhotographedPairs`). Chunks are written whole or not at all and carry a CRC-32C.
+Which samples count follows from two small arrays beside it: the views and lights that each
+texel sees. Of a sample that counts, a value that was not measured is NaN: the light has none of
+that colour, or the pixel was saturated. What no writer has written is minus infinity, which no
+sample is.
 
 Stored is the sample over the array's `unit`, a power of two near the capture's own samples, so
 that halves hold them whatever the units of radiance, intensity and length are.
@@ -27,6 +28,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.storage import FsspecStore
 
 from reflfield.errors import InputError
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.util.files import naming
 from reflfield.util.validation import check_shape
 
@@ -66,22 +68,30 @@ def _end_thread_of_zarr() -> None:
         thread.join(ENDING_SECONDS)
 
 
-def chunk_shape(n_texels: int, n_views: int, n_lights: int) -> tuple[int, int]:
-    """Texels and views of a chunk; they follow from the shape alone, not from the memory.
+def chunk_shape(n_texels: int, pairs: PhotographedPairs) -> tuple[int, int]:
+    """Texels and photographs of a chunk; they follow from the counts, not from the memory.
+
+    Of a full product of views and lights the photographs are those of whole views.
 
     Examples
     --------
-    The paper's dome, and a few photographs of a fine surface:
+    The paper's dome, a few photographs of a fine surface, and a light of its own for each:
 
-    >>> chunk_shape(40_000, 151, 151), chunk_shape(200_000, 16, 1)
-    ((256, 3), (4096, 8))
+    >>> chunk_shape(40_000, PhotographedPairs.product(151, 151))
+    (256, 453)
+    >>> chunk_shape(200_000, PhotographedPairs.product(16, 1))
+    (4096, 8)
+    >>> chunk_shape(40_000, PhotographedPairs.of_table(np.eye(240)))
+    (4096, 8)
     """
-    of_view = n_texels * n_lights * SAMPLE_BYTES
-    views = int(np.clip(WRITER_BYTES // of_view, 1, min(VIEWS_PER_CHUNK, n_views)))
-    fits = CHUNK_BYTES / (views * n_lights * SAMPLE_BYTES)
+    n_views = max(len(np.unique(pairs.view)), 1)
+    of_view = -(-len(pairs) // n_views)
+    fit = WRITER_BYTES // (n_texels * of_view * SAMPLE_BYTES)
+    photographs = of_view * int(np.clip(fit, 1, min(VIEWS_PER_CHUNK, n_views)))
+    fits = CHUNK_BYTES / (photographs * SAMPLE_BYTES)
     power_of_two = 2 ** int(np.log2(max(fits, 1.0)))
     texels = int(np.clip(power_of_two, LEAST_TEXELS_PER_CHUNK, MOST_TEXELS_PER_CHUNK))
-    return min(texels, n_texels), views
+    return min(texels, n_texels), min(photographs, len(pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,18 +105,26 @@ class Observed:
     lights : (n_texels, n_lights) bool
         True where the light's sample counts: everywhere if shadows stay in the data,
         else where the light reaches the texel.
-    pairs : (n_views, n_lights) bool
-        True where a photograph exists.
+    pairs : PhotographedPairs
+        Of those views and lights.
     """
 
     views: Bools
     lights: Bools
-    pairs: Bools
+    pairs: PhotographedPairs
 
     def __post_init__(self) -> None:
-        check_shape("views", self.views, (None, None))
-        check_shape("lights", self.lights, (len(self.views), None))
-        check_shape("pairs", self.pairs, (self.views.shape[1], self.lights.shape[1]))
+        check_shape("views", self.views, (None, self.pairs.n_views))
+        check_shape("lights", self.lights, (len(self.views), self.pairs.n_lights))
+
+    def of_texels(self, texels: slice | NDArray[np.integer]) -> Bools:
+        """(k, n_photographs) True where a sample of some texels was measured."""
+        return self.pairs.both(self.views[texels], self.lights[texels])
+
+    def views_under_lights(self) -> NDArray[np.float32]:
+        """(n_texels, n_lights) photographs under each light whose cameras see the texel."""
+        # Floats go through BLAS; the counts of views are exact in them.
+        return self.views.astype(np.float32) @ self.pairs.table.astype(np.float32)
 
     def count(self) -> int:
         """Number of samples measured.
@@ -116,12 +134,10 @@ class Observed:
         Two texels, two views, three lights; the second texel is seen from one view:
 
         >>> views = np.array([[True, True], [True, False]])
-        >>> Observed(views, np.ones((2, 3), bool), np.ones((2, 3), bool)).count()
+        >>> Observed(views, np.ones((2, 3), bool), PhotographedPairs.product(2, 3)).count()
         9
         """
-        # Floats go through BLAS; the counts of views are exact in them.
-        views_of_light = self.views.astype(np.float32) @ self.pairs.astype(np.float32)
-        return int((views_of_light * self.lights).sum(dtype=np.float64))
+        return int((self.views_under_lights() * self.lights).sum(dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +157,7 @@ class ObservationStore:
 
     @property
     def samples(self) -> zarr.Array:
-        """(n_texels, n_views, n_lights, 3) float16 on disk."""
+        """(n_texels, n_photographs, 3) float16 on disk."""
         return open_samples(self.location, mode="r")
 
     @cached_property
@@ -173,7 +189,7 @@ class ObservationStore:
         return int(self.samples.chunks[0])
 
     def read(self, texels: slice | NDArray[np.integer]) -> NDArray[np.float16]:
-        """Samples (k, n_views, n_lights, 3) of some texels, over `unit`; NaN: not measured.
+        """Samples (k, n_photographs, 3) of some texels, over `unit`; NaN: not measured.
 
         Parameters
         ----------
@@ -305,7 +321,7 @@ def place_of(store: str, key: str) -> str:
 
 
 def create_samples(
-    location: Location, n_texels: int, n_views: int, n_lights: int, unit: float = 1.0
+    location: Location, n_texels: int, pairs: PhotographedPairs, unit: float = 1.0
 ) -> zarr.Array:
     """Create an array of samples, or open the one that an interrupted run began.
 
@@ -314,14 +330,16 @@ def create_samples(
     Parameters
     ----------
     location : Path or str
-    n_texels, n_views, n_lights : int
+    n_texels : int
+    pairs : PhotographedPairs
+        One for each photograph.
     unit : float
         What the numbers are in, 1/sr.
 
     Returns
     -------
     zarr.Array
-        (n_texels, n_views, n_lights, 3) float16. Chunks never written count as missing.
+        (n_texels, n_photographs, 3) float16. Chunks never written count as missing.
 
     Raises
     ------
@@ -330,11 +348,10 @@ def create_samples(
     OSError
         If the system cannot say what is there, or cannot write.
     """
-    for name, count in (("texels", n_texels), ("views", n_views), ("lights", n_lights)):
+    for name, count in (("texels", n_texels), ("photographs", len(pairs))):
         if count < 1:
             raise InputError(f"{name}: expected at least one, received {count}")
-    shape = (n_texels, n_views, n_lights, 3)
-    chunks = (*chunk_shape(n_texels, n_views, n_lights), n_lights, 3)
+    shape, chunks = (n_texels, len(pairs), 3), (*chunk_shape(n_texels, pairs), 3)
     try:
         stored = _opened_array(location, "r+")
     except FileNotFoundError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,12 @@ from reflfield.capture.capture import Capture
 from reflfield.capture.color_spaces import LUMINANCE_WEIGHTS
 from reflfield.observations.frame_resampling import Nodes, ResamplingOptions, resample, side_for
 from reflfield.observations.image_projection import directions_of, facing_irradiance
-from reflfield.observations.store import Bools, ObservationStore, Observed
+from reflfield.observations.store import (
+    LEAST_TEXELS_PER_CHUNK,
+    Bools,
+    ObservationStore,
+    Observed,
+)
 from reflfield.observations.texel_samples import (
     POWERS,
     TexelSamples,
@@ -47,6 +53,8 @@ TEXELS_COUNTED_AT_ONCE = 1024
 FEW_GAPS = 0.01
 # Samples that are looked through for those not measured.
 COUNTING_BYTES = 64 << 20
+# Of the products of views and lights of a block of texels.
+PRODUCT_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +102,7 @@ class SampleCount:
 
 
 def luminance_of(texels: TexelSamples, cosines: Floats) -> Floats:
-    """Luminance (n, n_views, n_lights) of samples, in their unit; NaN of no channel.
+    """Luminance (n, n_photographs) of samples, in their unit; NaN of no channel.
 
     Where only some channels were measured the sample is taken to have the colour of its
     texel: that of the matt surface which explains the samples best of which all channels
@@ -114,33 +122,35 @@ def luminance_of(texels: TexelSamples, cosines: Floats) -> Floats:
     --------
     An orange texel under white light, and the same half as bright under blue light alone:
 
-    >>> samples = np.array([[[[0.4, 0.2, 0.1], [np.nan, np.nan, 0.05]]]])
+    >>> from reflfield.observations.photographed_pairs import PhotographedPairs
+    >>> samples = np.array([[[0.4, 0.2, 0.1], [np.nan, np.nan, 0.05]]])
     >>> one = np.array([[[0.0, 0, 1]]])
-    >>> seen = np.ones((1, 2), bool)
-    >>> few = TexelSamples(samples, one, one.repeat(2, 1), seen[:, :1], seen, seen[:1])
+    >>> seen, pairs = np.ones((1, 2), bool), PhotographedPairs.product(1, 2)
+    >>> few = TexelSamples(samples, one, one.repeat(2, 1), seen[:, :1], seen, pairs)
     >>> luminance_of(few, np.ones((1, 2))).round(4)
-    array([[[0.2353, 0.1176]]], dtype=float32)
+    array([[0.2353, 0.1176]], dtype=float32)
     """
     values = texels.samples.astype(np.float32)
     if not texels.has_gaps or not (unmeasured := np.isnan(values)).any():
         return values @ LUMINANCE
     values = np.where(unmeasured, np.float32(0.0), values)
-    colour = _matt_colour(values, ~unmeasured & texels.seen[..., None], cosines) * LUMINANCE
-    whole = colour.sum(axis=1)[:, None, None]
-    shown = np.einsum("nvlc,nc->nvl", ~unmeasured, colour)
+    counted = ~unmeasured & texels.seen[..., None]
+    colour = _matt_colour(values, counted, cosines[:, texels.pairs.light]) * LUMINANCE
+    whole = colour.sum(axis=1)[:, None]
+    shown = np.einsum("npc,nc->np", ~unmeasured, colour)
     share = np.divide(shown, whole, out=np.zeros_like(shown), where=whole > 0)
     known = values @ LUMINANCE
     scaled = np.divide(known, share, out=np.full_like(known, np.nan), where=share > 0)
-    return np.where(unmeasured.any(axis=3), scaled, known).astype(np.float32)
+    return np.where(unmeasured.any(axis=2), scaled, known).astype(np.float32)
 
 
 def _matt_colour(values: Floats, counted: Bools, cosines: Floats) -> Floats:
     """Values (n, 3) over cosines by least squares, over whole samples where there are any."""
-    whole = np.asarray(counted.all(axis=3))[..., None]
+    whole = np.asarray(counted.all(axis=2))[..., None]
     has_whole = np.asarray(whole.any(axis=(1, 2)))[:, None, None]
     counted = np.where(has_whole, whole, counted)
-    total = np.einsum("nvlc,nvlc,nl->nc", values, counted, cosines)
-    weight = np.einsum("nvlc,nl->nc", counted, np.square(cosines))
+    total = np.einsum("npc,npc,np->nc", values, counted, cosines)
+    weight = np.einsum("npc,np->nc", counted, np.square(cosines))
     return np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
 
 
@@ -196,13 +206,27 @@ class TexelReader:
 
     @property
     def sample_bytes_per_texel(self) -> int:
-        """Memory of one texel's samples in the domain, with taps."""
+        """Memory of one texel's samples and directions."""
+        n_directions = self.capture.n_views + self.capture.n_lights
+        return 2 * 12 * len(self.store.observed.pairs) + 80 * n_directions
+
+    @property
+    def product_bytes_per_texel(self) -> int:
+        """Memory of one texel's samples in the domain as a product of views and lights."""
         n_views, n_lights = self.capture.n_views, self.capture.n_lights
         return 2 * 12 * n_views * n_lights + 80 * (n_views + n_lights)
 
     def blocks_of(self, texels: Indices) -> list[Indices]:
         """Texels, ascending, cut where the chunks of the store are."""
-        edges = np.arange(0, self.n_texels, self.store.texels_per_chunk)[1:]
+        return self._cut(texels, self.store.texels_per_chunk)
+
+    def product_blocks_of(self, texels: Indices) -> list[Indices]:
+        """Texels, ascending, cut so that their products of views and lights fit in memory."""
+        fit = max(PRODUCT_BYTES // self.product_bytes_per_texel, LEAST_TEXELS_PER_CHUNK)
+        return self._cut(texels, min(fit, self.store.texels_per_chunk))
+
+    def _cut(self, texels: Indices, step: int) -> list[Indices]:
+        edges = np.arange(0, self.n_texels, step)[1:]
         parts = np.split(texels, np.searchsorted(texels, edges))
         return [part for part in parts if len(part)]
 
@@ -257,9 +281,8 @@ class TexelReader:
         step, total = max(1, COUNTING_BYTES // self.sample_bytes_per_texel), 0
         for first in range(0, len(texels), step):
             part = slice(first, first + step)
-            seen = observed.views[part, :, None] & observed.lights[part, None] & observed.pairs
-            nothing = np.isnan(self.store.read(texels[part])).all(axis=3)
-            total += int(np.count_nonzero(nothing & seen))
+            nothing = np.isnan(self.store.read(texels[part])).all(axis=2)
+            total += int(np.count_nonzero(nothing & observed.of_texels(part)))
         return total
 
     def transformed(self, texels: Indices) -> TransformedSamples:
@@ -282,7 +305,8 @@ class TexelReader:
         if self.sides[1] > 1:
             cosines = softened_cosine(lights[..., 2]).astype(np.float32)
         values = luminance_of(measured, cosines) * np.float32(measured.unit)
-        samples = np.where(measured.seen, values, np.float32(np.nan))
+        seen = np.where(measured.seen, values, np.float32(np.nan))
+        samples = measured.pairs.as_product(seen, np.nan)
         if self.sides[0] == 1:
             samples, views = _mean_over(samples, 1), _upright(len(texels))
         if self.sides[1] == 1:
@@ -297,24 +321,33 @@ class TexelReader:
         # Outside a spot's cone there is no light that could come back.
         strong = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
         shadowed = strong & ~lit
-        weights = np.zeros((*shadowed.shape, 3), np.float32)
-        total = np.zeros_like(weights)
-        t, j = np.nonzero(shadowed)
         pairs = self.store.observed.pairs
-        samples = self.store.read(texels)
-        for i in range(views.shape[1]):
-            used = views[t, i] & pairs[i, j]
-            values = samples[t[used], i, j[used]].astype(np.float32)
-            transformed = transform(values * np.float32(self.store.unit), self.options.domain)
-            measured = ~np.isnan(transformed)
-            weights[t[used], j[used]] += measured
-            total[t[used], j[used]] += np.where(measured, transformed, np.float32(0.0))
-        means = total / np.maximum(weights, np.float32(1.0))
-        return Shade(means.astype(np.float32), weights, lights)
+        t, photograph = np.nonzero(pairs.both(views, shadowed))
+        values = self.store.read(texels)[t, photograph].astype(np.float32)
+        transformed = transform(values * np.float32(self.store.unit), self.options.domain)
+        measured = ~np.isnan(transformed)
+        group = t * pairs.n_lights + pairs.light[photograph]
+        weights = grouped_sums(measured, group, shadowed.size).reshape(*shadowed.shape, 3)
+        known = np.where(measured, transformed, np.float32(0.0))
+        total = grouped_sums(known, group, shadowed.size).reshape(weights.shape)
+        means = total / np.maximum(weights, 1.0)
+        return Shade(means.astype(np.float32), weights.astype(np.float32), lights)
 
     def nodes(self, texels: Indices) -> Nodes:
         """Texels resampled onto the nodes of their frames."""
         return resample(self.transformed(texels), self.sides, self.options.smoothness)
+
+
+def grouped_sums(values: NDArray[Any], group: Indices, n_groups: int) -> NDArray[np.float64]:
+    """Sums (n_groups, k) of the rows of values (n, k) that have the same number.
+
+    Examples
+    --------
+    >>> grouped_sums(np.array([[1.0], [2.0], [4.0]]), np.array([2, 0, 2]), 3).ravel()
+    array([2., 0., 5.])
+    """
+    columns = [np.bincount(group, column, n_groups) for column in values.T]
+    return np.stack(columns, axis=1)
 
 
 def _mean_over(samples: Floats, axis: int) -> Floats:

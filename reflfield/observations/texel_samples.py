@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.sphere.hemisphere import HORIZON_SOFTNESS, HemisphereGrid, softened_cosine
 
 Floats = NDArray[np.float32]
@@ -65,14 +66,14 @@ class TexelSamples:
 
     Parameters
     ----------
-    samples : (n, n_views, n_lights, 3) float
+    samples : (n, n_photographs, 3) float
         Radiance over facing irradiance, over `unit`.
     views, lights : (n, n_directions, 3) float32
         Unit directions in the world frame.
     view_seen, light_seen : (n, n_directions) bool
         Which count.
-    pairs : (n_views, n_lights) bool
-        Which were photographed.
+    pairs : PhotographedPairs
+        View and light of each photograph.
     unit : float
         What the samples are in, 1/sr.
     has_gaps : bool
@@ -84,14 +85,14 @@ class TexelSamples:
     lights: Floats
     view_seen: Bools
     light_seen: Bools
-    pairs: Bools
+    pairs: PhotographedPairs
     unit: float = 1.0
     has_gaps: bool = True
 
     @property
     def seen(self) -> Bools:
-        """(n, n_views, n_lights) True where the texel is seen, lit and photographed."""
-        return self.view_seen[:, :, None] & self.light_seen[:, None] & self.pairs
+        """(n, n_photographs) True where the texel is seen and lit."""
+        return self.pairs.both(self.view_seen, self.light_seen)
 
 
 def local_directions(local_from_world: Directions, directions: Directions) -> Directions:
@@ -192,9 +193,10 @@ def transformed_samples(
         cosine = softened_cosine(light[..., 2]).astype(np.float32)
     safe = np.where(light_seen, cosine, np.float32(1.0))
     # A third of the samples count at a dome: only these are transformed.
-    t, i, j = np.nonzero(view_seen[:, :, None] & light_seen[:, None] & texels.pairs)
-    values = np.zeros(texels.samples.shape, np.float32)
-    ratio = texels.samples[t, i, j].astype(np.float32) * np.float32(texels.unit)
+    t, photograph = np.nonzero(texels.pairs.both(view_seen, light_seen))
+    i, j = texels.pairs.view[photograph], texels.pairs.light[photograph]
+    values = np.zeros((*view_seen.shape, light_seen.shape[1], 3), np.float32)
+    ratio = texels.samples[t, photograph].astype(np.float32) * np.float32(texels.unit)
     ratio /= safe[t, j][:, None]
     channels = all_channels()
     unmeasured = np.isnan(ratio) if texels.has_gaps else np.zeros(0, np.bool_)
@@ -209,7 +211,7 @@ def transformed_samples(
         light_taps=direction_taps(light, sides[1]),
         view_weights=view_seen.astype(np.float32),
         light_weights=light_seen * safe ** np.float32(2.0 / POWERS[domain]),
-        pairs=texels.pairs.astype(np.float32),
+        pairs=texels.pairs.table.astype(np.float32),
         channels=channels,
     )
 

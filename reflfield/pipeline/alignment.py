@@ -231,7 +231,7 @@ class RawLuminance:
 
     def read(self, rows: NDArray[np.int64]) -> SampleSet:
         """Samples of some texels, read some at a time."""
-        step = max(1, self.block_bytes // self.reader.sample_bytes_per_texel)
+        step = max(1, self.block_bytes // self.reader.product_bytes_per_texel)
         parts = [
             self.reader.luminance(self.texels[rows[first : first + step]])
             for first in range(0, len(rows), step)

@@ -107,7 +107,7 @@ def completed(
             "completing all texels",
             inferred,
             (completion, resampling),
-            reader.blocks_of(others),
+            reader.product_blocks_of(others),
             at_once=columns_at_once(resources, reader.n_pairs),
         )
         coefficients[others] = parts.joined("coefficients")

@@ -45,7 +45,7 @@ def write_compressed(texels: Resampled, maker: FieldMaker, folder: Path) -> dict
     write_field(folder / "field.rfld", made)
     write_model(folder / "model.npz", model, reader.local_from_world)
     size = (folder / "field.rfld").stat().st_size
-    raw = int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 6
+    raw = results.base_reader(context).store.raw_bytes()
     error = sample_error(made, results.base_reader(context), results.measured_texels(context))
     n_fitted = len(results.measured_texels(context))
     counted = reader.count_fitted(np.flatnonzero(results.sampled(context).any(axis=1)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -54,7 +54,7 @@ from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
-from reflfield.pipeline.cache import plain
+from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import working_bytes, writers_at_once
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
@@ -72,13 +72,17 @@ LOBE_TEXELS, USUAL_LOBES = 1024, 3
 TANGENT_ROUNDS = 2
 # Texels and quantile of their samples' luminance that is taken for white.
 WHITE_TEXELS, WHITE_QUANTILE = 1024, 0.995
+# Quantiles between which samples show how light comes in beside the view; light is from all
+# sides where they reach farther than so many degrees.
+ANGLE_QUANTILES, ALL_SIDES = (0.01, 0.99), 60.0
 # Rows of pixels that tables are fitted to; each has several texels.
 PIXEL_ROWS = TABLE_ROWS // 2
 # Share of the working memory for samples kept, for pixels, and for derivatives; what is larger
 # goes to files, but for pixels, of which then only some are fitted to.
 SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 6, 1 / 6, 1 / 3
-# Pixels under a light that are fitted to at most: more would take hours.
-MOST_PIXELS = 32_000_000
+# Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
+# would take hours, or minutes.
+MOST_PIXELS, MOST_FOOTPRINTS = 32_000_000, 1_500_000
 # Memory of a pixel under a light, and of a pixel with the texels under it.
 VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 # In the folder of the stage.
@@ -133,6 +137,15 @@ class HalfVectorFit:
         luminance = luminance[np.isfinite(luminance)]
         white = float(np.quantile(luminance, WHITE_QUANTILE)) if len(luminance) else 0.0
         return white if white > 0 else 1.0
+
+    @cached_property
+    def light_angles(self) -> tuple[float, float]:
+        """Angles between view and light within which nearly all samples lie, degrees."""
+        some = results.random_texels(self.context, WHITE_TEXELS)
+        parts = results.base_reader(self.context).blocks_of(some)
+        angles = np.concatenate([self._block(part, 1.0).light_angles() for part in parts])
+        low, high = np.quantile(angles, ANGLE_QUANTILES) if len(angles) else (0.0, np.pi)
+        return float(np.degrees(low)), float(np.degrees(high))
 
     def _block(self, texels: Indices, white: float) -> SampleBlock:
         samples = results.base_reader(self.context).measured(texels)
@@ -246,7 +259,8 @@ class HalfVectorFit:
         n_values = int(np.dot(covered, n_photographs))
         n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
         in_memory = working_bytes(self.context) * PIXELS_SHARE
-        return min(1.0, MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
+        of_values = min(MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
+        return min(1.0, of_values, MOST_FOOTPRINTS / max(sum(covered), 1))
 
     def allocator(
         self, views: Sequence[ViewPixels], n_lobes: int, folder: Path
@@ -427,7 +441,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     write_field(folder / "field.rfld", made)
     write_model(folder / MODEL, model, fit.white)
     size = (folder / "field.rfld").stat().st_size
-    raw = int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 6
+    raw = results.base_reader(context).store.raw_bytes()
     error = sample_error(made, results.base_reader(context), results.measured_texels(context))
     counted = results.base_reader(context).count_fitted(
         np.flatnonzero(results.sampled(context).any(axis=1))
@@ -449,4 +463,23 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "relative error of their cube roots": error.cube_root,
         "LDR PSNR of the samples, dB": error.psnr_ldr,
         "samples measured": error.n_samples,
+        WARNINGS: list(beside_the_view(*fit.light_angles)),
     }
+
+
+def beside_the_view(low: float, high: float) -> Iterator[str]:
+    """Say it where all light came from near the cameras; angles in degrees.
+
+    Examples
+    --------
+    >>> list(beside_the_view(2.0, 150.0))
+    []
+    >>> next(beside_the_view(9.6, 9.8)).partition(";")[0]
+    'all light comes from 10 to 10 degrees beside the view'
+    """
+    if high < ALL_SIDES:
+        yield (
+            f"all light comes from {low:.0f} to {high:.0f} degrees beside the view; under "
+            "light from elsewhere the field shows what it continues those samples to, and no "
+            "more is known; photograph with lights apart from the camera, too"
+        )

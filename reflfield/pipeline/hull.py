@@ -37,6 +37,8 @@ def write_hull(context: Context, folder: Path) -> dict[str, Any]:
             "views that contradict the others": [c.view for c in hull.contradictions],
             LEFT_OUT: list(hull.left_out),
             "small parts left out": sum(hull.specks.values()),
+            "median overlap with the silhouettes": float(np.median(hull.overlap)),
+            "least overlap with a silhouette": float(hull.overlap.min()),
             WARNINGS: list(hull.warnings),
         }
     scene = RayScene(mesh)
@@ -50,12 +52,12 @@ def write_hull(context: Context, folder: Path) -> dict[str, Any]:
 def _carved(context: Context, folder: Path) -> tuple[Mesh, HullReport]:
     """Visual hull; what does not fit into memory is kept in the folder meanwhile."""
     cameras, options = context.training.cameras, context.options.hull
+    silhouettes = results.silhouettes(context)
+    made = context.training.silhouette_origin(0) == "photographs"
     if keeps_distances(context):
-        return visual_hull(cameras, results.silhouettes(context), options)
+        return visual_hull(cameras, silhouettes, options, made=made)
     with TemporaryDirectory(dir=folder) as scratch:
-        return visual_hull(
-            cameras, results.silhouettes(context), options, scratch=Path(scratch)
-        )
+        return visual_hull(cameras, silhouettes, options, scratch=Path(scratch), made=made)
 
 
 def _listed(value: Any) -> Any:

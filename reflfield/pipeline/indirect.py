@@ -21,6 +21,11 @@ from reflfield.pipeline.context import Context
 # Texels so near to one that the light reaches, in texel spacings and not less than a pixel, are
 # at the edge of a shadow: their pixels mix both.
 EDGE_SPACINGS = 1.5
+# Lights of each texel that are kept where each is that of a few photographs: those with samples
+# in its shadow, and others spread evenly, under which no texel may come out brighter.
+MOST_LIGHTS = 48
+# Steps of this share of the lights leave the most even gaps.
+GOLDEN_SHARE = (5**0.5 - 1) / 2
 
 
 def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
@@ -67,7 +72,8 @@ def texels_at_edge(context: Context) -> NDArray[np.bool_]:
 def shade_rows(shade: Shade, unit: float, rows: NDArray[np.intp]) -> Shade:
     """Return some rows of a shade whose values are halves in a unit."""
     values = shade.values[rows].astype(np.float32) * np.float32(unit)
-    return replace(shade, values=values, weights=shade.weights[rows], lights=shade.lights[rows])
+    weights = shade.weights[rows].astype(np.float32)
+    return replace(shade, values=values, weights=weights, lights=shade.lights[rows])
 
 
 def shade_block(
@@ -88,13 +94,35 @@ def shade_block(
     used = (shade.weights > 0) & inside[..., None]
     # Of views that have measured any channel.
     n_views = shade.weights.max(axis=2)
+    n_kept = used.shape[1] if reader.store.observed.pairs.is_product else MOST_LIGHTS
+    kept = np.arange(len(texels))[:, None], lights_kept(np.asarray(used.any(axis=2)), n_kept)
     return {
-        "values": (shade.values / np.float32(reader.domain_unit)).astype(np.float16),
-        "weights": used.astype(np.float32),
-        "lights": shade.lights,
+        "values": (shade.values[kept] / np.float32(reader.domain_unit)).astype(np.float16),
+        "weights": used[kept],
+        "lights": shade.lights[kept],
         "samples": np.array(n_views.sum(dtype=np.float64)),
         "used": np.array((n_views * inside).sum(dtype=np.float64)),
     }
+
+
+def lights_kept(used: NDArray[np.bool_], most: int = MOST_LIGHTS) -> NDArray[np.intp]:
+    """Lights (n, most) of each texel, ascending: used ones before others, spread evenly.
+
+    Parameters
+    ----------
+    used : (n, n_lights) bool
+        Lights with samples.
+    most : int
+
+    Examples
+    --------
+    >>> lights_kept(np.array([[False, False, False, True, False, False]]), 3)
+    array([[0, 3, 5]])
+    """
+    n_lights = used.shape[1]
+    rank = np.argsort(np.argsort(np.arange(n_lights) * GOLDEN_SHARE % 1.0))
+    order = np.argsort(np.where(used, rank - n_lights, rank), axis=1)
+    return np.sort(order[:, :most], axis=1)
 
 
 def neighbourhood_reached(

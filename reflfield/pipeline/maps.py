@@ -47,7 +47,7 @@ def _write_maps(context: Context, field: ReflectanceField, folder: Path) -> None
 def average_samples(context: Context, folder: Path) -> NDArray[np.float32]:
     """Mean observed sample of every texel, (n_texels, 3); NaN where there is none."""
     store = results.base_reader(context).store
-    each = SAMPLE_BYTES * store.observed.pairs.size
+    each = SAMPLE_BYTES * len(store.observed.pairs)
     step = int(np.clip(context.resources.block_bytes // each, 1, store.texels_per_chunk))
     parts = context.blocks(folder).map(
         "mean samples",
@@ -66,8 +66,7 @@ def averages_block(
     observed = store.observed
     for first in range(texels[0], texels[-1] + 1, step):
         part = slice(first, min(first + step, texels[-1] + 1))
-        seen = observed.views[part, :, None] & observed.lights[part, None, :] & observed.pairs
-        parts.append(mean_sample(store.read(part), seen) * store.unit)
+        parts.append(mean_sample(store.read(part), observed.of_texels(part)) * store.unit)
     return {"averages": np.concatenate(parts).astype(np.float32)}
 
 

@@ -9,10 +9,9 @@ from reflfield.capture.image_files import image_size
 from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.image_errors import PIXELS_AT_ONCE
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
     SAMPLE_BYTES,
-    VIEWS_PER_CHUNK,
-    WRITER_BYTES,
     chunk_shape,
 )
 from reflfield.options import Resources, gigabytes
@@ -61,8 +60,8 @@ def least_memory(context: Context) -> int:
         max(PHOTOGRAPH_BYTES, SILHOUETTE_BYTES * made) * max(pixels),
         compared_bytes(max(held, default=0)),
     )
-    texels, n_lights = most_texels(context), training.n_lights
-    samples = min(WRITER_BYTES, VIEWS_PER_CHUNK * texels * n_lights * SAMPLE_BYTES)
+    texels = most_texels(context)
+    samples = writer_bytes(texels, PhotographedPairs.of(training))
     images = sum(pixels) // 8 + largest + texels * TEXEL_BYTES + WRITER_COPIES * samples
     rank = max(context.options.completion.rank, context.options.compression.rank)
     each = TEXEL_BYTES + training.n_views + 7 * training.n_lights + 12 * rank
@@ -143,15 +142,15 @@ def working_bytes(context: Context) -> int:
     return max(ceiling - held, ceiling // 16)
 
 
+def writer_bytes(n_texels: int, pairs: PhotographedPairs) -> int:
+    """Samples of the photographs that are written together."""
+    return chunk_shape(n_texels, pairs)[1] * n_texels * SAMPLE_BYTES
+
+
 def writers_at_once(context: Context) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
-    n_texels, n_views, n_lights = (
-        len(results.texels(context)),
-        context.training.n_views,
-        context.training.n_lights,
-    )
-    views = chunk_shape(n_texels, n_views, n_lights)[1]
-    samples = views * n_texels * n_lights * SAMPLE_BYTES
+    n_texels = len(results.texels(context))
+    samples = writer_bytes(n_texels, results.observed(context).pairs)
     pixels = max(camera.width * camera.height for camera in context.training.cameras)
     photographs = max(WRITER_COPIES * context.resources.block_bytes, PHOTOGRAPH_BYTES * pixels)
     free = context.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES

@@ -148,7 +148,7 @@ def _fitted_to_samples(
             f"frames against the model{name}",
             partial(frames_block, spread=float(spread)),
             (reader, model),
-            reader.blocks_of(aligned),
+            reader.product_blocks_of(aligned),
         )
         frames = reader.local_from_world.copy()
         frames[aligned] = refined.joined("frames")
@@ -175,7 +175,7 @@ def _fitted_once(
             reader.transformed,
             model,
             measured,
-            reader.sample_bytes_per_texel,
+            reader.product_bytes_per_texel,
             options,
             workers=context.resources.workers,
             seed=context.options.seed,
@@ -217,7 +217,7 @@ def _with_coefficients(
     work: str,
 ) -> ClusteredModel:
     """Model whose coefficients of some texels are solved for, by blocks of the named work."""
-    parts = blocks.map(work, solve, (reader, model), reader.blocks_of(texels))
+    parts = blocks.map(work, solve, (reader, model), reader.product_blocks_of(texels))
     coefficients = model.coefficients.copy()
     coefficients[texels] = parts.joined("coefficients")
     return replace(model, coefficients=coefficients)
@@ -247,7 +247,7 @@ def _noise(context: Context, model: ClusteredModel, reader: TexelReader) -> NDAr
     """Variance of samples about the model of the grids, from some texels."""
     measured = results.measured_texels(context)
     options = context.options
-    most = max(1, options.compression.samples.max_bytes // reader.sample_bytes_per_texel)
+    most = max(1, options.compression.samples.max_bytes // reader.product_bytes_per_texel)
     count = min(len(measured), TEXELS_FOR_NOISE, most)
     some = np.sort(np.random.default_rng(options.seed).choice(measured, count, replace=False))
     usual = normalised(model, model.residuals[-1] ** 2, measured)

@@ -43,7 +43,7 @@ def write_observations(context: Context, folder: Path) -> dict[str, Any]:
     write_measured(folder, projected.measured)
     for line in clipping_lines(context.training, projected):
         log.warning("%s", line)
-    n_samples = results.view_visible(context).size * context.training.n_lights
+    n_samples = len(results.texels(context)) * len(context.training.photographs)
     return {
         "photographs": projected.photographs,
         "samples": n_samples,

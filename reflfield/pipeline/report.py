@@ -95,7 +95,7 @@ def report_content(
         key_numbers=sections.key_numbers(
             main,
             file_bytes=size,
-            raw_bytes=raw_bytes(context),
+            raw_bytes=results.base_reader(context).store.raw_bytes(),
             seconds=model_selection.total_seconds(context),
         ),
         sections=tuple(parts),
@@ -114,13 +114,6 @@ def _subtitle(context: Context) -> str:
         f"{training.n_views} views, {training.n_lights} lights, {len(training.photographs)} "
         f"photographs, {results.base_reader(context).n_texels} texels. "
         f"Held out: {hold_out.held_out_sentence(context.split)}."
-    )
-
-
-def raw_bytes(context: Context) -> int:
-    """Samples of the capture as half floats, unobserved ones included."""
-    return (
-        int(np.prod(results.observed(context).views.shape)) * context.training.n_lights * 3 * 2
     )
 
 
@@ -145,9 +138,9 @@ def warnings_of(context: Context) -> Iterator[str]:
             f"{unseen} of {n_texels} texels ({unseen / n_texels:.0%}) have no sample; they "
             "repeat the nearest texel that has."
         )
-    missing = int((~results.observed(context).pairs).sum())
-    if missing:
-        total = results.observed(context).pairs.size
+    pairs = results.observed(context).pairs
+    total = pairs.n_views * pairs.n_lights
+    if missing := total - len(pairs):
         yield f"{missing} of {total} pairs of view and light have no photograph."
 
 
@@ -333,7 +326,8 @@ def _compression_section(context: Context) -> Section:
     path = results.field_file(context)
     parts = describe(open_field(path)).stored_bytes
     rest = path.stat().st_size - sum(parts.values())
-    return sections.compression_section({**parts, "header, names": rest}, raw_bytes(context))
+    raw_bytes = results.base_reader(context).store.raw_bytes()
+    return sections.compression_section({**parts, "header, names": rest}, raw_bytes)
 
 
 def _stage(record: Any) -> sections.StageSummary:

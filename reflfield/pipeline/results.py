@@ -15,7 +15,7 @@ from reflfield.field.indirect_light import IndirectLight
 from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.geometry.uv_atlas import Atlas
-from reflfield.observations.image_projection import pairs_photographed
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import Location, ObservationStore, Observed
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline.cache import RESTARTABLE
@@ -123,15 +123,14 @@ def observed(context: Context) -> Observed:
     lights = light_visible(context)
     if context.visibility_kind != "factored":
         lights = np.ones_like(lights)
-    return Observed(view_visible(context), lights, pairs_photographed(context.training))
+    return Observed(view_visible(context), lights, PhotographedPairs.of(context.training))
 
 
 @cached("visibility")
 def sampled(context: Context) -> Bools:
     """(n_texels, n_lights) True where a camera sees the texel under a light that counts."""
     of_texels = observed(context)
-    pairs = of_texels.views.astype(np.float32) @ of_texels.pairs.astype(np.float32)
-    return np.asarray(pairs * of_texels.lights > 0)
+    return np.asarray(of_texels.views_under_lights() * of_texels.lights > 0)
 
 
 def samples_location(context: Context) -> Location:

@@ -52,13 +52,10 @@ def _photographs(context: Context, projected: dict[str, Any]) -> CountedItems:
 
 def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItems:
     """One sample for each texel and photograph: fitted, unseen, shadowed, below the horizon."""
-    observed, pairs = (
-        results.observed(context),
-        results.observed(context).pairs.astype(np.float32),
-    )
-    seen = observed.views.astype(np.float32) @ pairs
+    observed = results.observed(context)
+    seen = observed.views_under_lights()
     shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
-    unseen = np.sum((~observed.views).astype(np.float32) @ pairs, dtype=np.float64)
+    unseen = seen.shape[0] * len(observed.pairs) - np.sum(seen, dtype=np.float64)
     # As the completion counted them, where there is one.
     handed_on = counts.get("completion", {}).get("samples observed", observed.count())
     used = counts["compression"]["samples fitted"]
@@ -86,7 +83,7 @@ def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItem
 
 def _values(context: Context, projected: dict[str, Any]) -> CountedItems:
     """Three values for each photograph and texel that its camera sees: measured or not."""
-    pairs = results.observed(context).pairs.sum(axis=1)
+    of_views = results.observed(context).pairs.table.sum(axis=1)
     names = {
         "measured": "measured",
         "saturated": "saturated: at least as bright, left out of the samples",
@@ -98,7 +95,7 @@ def _values(context: Context, projected: dict[str, Any]) -> CountedItems:
     return CountedItems(
         "observations",
         "values",
-        3 * int(results.view_visible(context).sum(axis=0) @ pairs),
+        3 * int(results.view_visible(context).sum(axis=0) @ of_views),
         {name: projected[f"values {kind}"] for kind, name in names.items()},
     )
 

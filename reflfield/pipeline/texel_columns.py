@@ -28,7 +28,7 @@ COLUMNS_AT_ONCE = 256
 
 def texels_at_once(reader: TexelReader, block_bytes: int) -> int:
     """Texels that are resampled together."""
-    each = reader.sample_bytes_per_texel + COPIES_WHILE_RESAMPLING * 12 * reader.n_pairs
+    each = reader.product_bytes_per_texel + COPIES_WHILE_RESAMPLING * 12 * reader.n_pairs
     return int(np.clip(block_bytes // each, 1, MOST_TEXELS_AT_ONCE))
 
 

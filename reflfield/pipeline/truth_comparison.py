@@ -176,7 +176,7 @@ def _completion_at(context: Context, points: dict[str, NDArray[Any]]) -> Complet
     used[training] = (
         measured.views[texels][:, :, None]
         & measured.lights[texels][:, None, :]
-        & measured.pairs[None]
+        & measured.pairs.table[None]
     )
     return completion_error(completed[asked], points["samples"][close][asked], used[asked])
 

@@ -44,7 +44,7 @@ class Benchmark(NamedTuple):
 
     photographs: str
     held_out: str = ""  # in words
-    words: tuple[str, ...] = ()  # of `reflfield run`; none: it is the demo
+    words: tuple[str | Path, ...] = ()  # of `reflfield run`; none: it is the demo
     scene: str = ""  # of capture-sim, or
     folder: str = ""  # of the test data
     frames: tuple[tuple[str, str], ...] = ()  # compared besides: name, file in the folder
@@ -76,6 +76,15 @@ CAPTURES = {
         "2 views",
         ("--hold-out", "views=2"),
         folder="middlebury_sparse_rings/dinoSparseRing",
+    ),
+    "mia_guanyu_flash": Benchmark(
+        "240, each with a view and a light of its own",
+        "8 photographs",
+        (
+            *("--hold-out", "photographs=8", "--encoding"),
+            DATA / "mia_guanyu_flash" / "guan-yu-replicability.vset",
+        ),
+        folder="mia_guanyu_flash",
     ),
     "tiny": Benchmark(
         "8 x 6, simulated",

@@ -73,6 +73,17 @@ class TestUniformBackdrop:
         photograph[10:12, 140:142] = 0.6
         assert overlap(silhouette_from_photographs([photograph]), two) > 0.98
 
+    def test_dim_parts_before_a_backdrop_that_a_flash_lights_unevenly_are_found(self):
+        # The backdrop is as bright at the bottom as a dim leg is at the top.
+        body, legs = disc((80, 50), 30), np.zeros((SIZE, SIZE), np.float32)
+        legs[70:125, 62:70] = legs[70:125, 90:98] = 1
+        front = np.where(body > 0, 0.6, 0.03)[..., None]
+        back = 0.001 + 0.012 * (np.arange(SIZE) / SIZE)[:, None, None] ** 2
+        noise = np.random.default_rng(0).normal(0, 2e-4, (SIZE, SIZE, 3))
+        truth = np.maximum(body, legs)
+        found = silhouette_from_photographs([composed(truth, front, back + noise)])
+        assert overlap(found, truth) > 0.95
+
     def test_dim_parts_before_pure_black_are_found(self):
         # lit from the left only: the right half gets a hundredth
         front = np.where(np.arange(SIZE) < 80, 0.6, 0.006)[None, :, None]

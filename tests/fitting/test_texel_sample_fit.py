@@ -13,10 +13,13 @@ from reflfield.fitting.texel_sample_fit import (
     SampleBlock,
     SampleBlocks,
     fit_to_samples,
+    sample_block,
     solve_coefficients,
     start_model,
     with_start_colors,
 )
+from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.texel_samples import TexelSamples
 from tests.fitting.conftest import frames_about, random_model, unit
 
 N_VIEWS, N_LIGHTS = 6, 12
@@ -47,6 +50,7 @@ def block_of(rng, model, texels=None, views=None, lights=None):
         values=values,
         views=views,
         lights=lights,
+        camera=view.astype(np.int16),
     )
 
 
@@ -66,6 +70,7 @@ def without_samples(block, row):
         view=block.view[kept],
         light=block.light[kept],
         values=block.values[kept],
+        camera=block.camera[kept],
     )
 
 
@@ -167,3 +172,41 @@ def test_a_graph_joins_texels_that_face_the_same_way():
         True, False, False, True,
     ]  # fmt: skip
     np.testing.assert_allclose(graph.laplacian() @ np.ones(4), 0)
+
+
+@pytest.mark.parametrize("photographed", ["each view under a light of its own", "all pairs"])
+def test_samples_keep_their_directions_however_few_pairs_were_photographed(
+    small_rng, photographed
+):
+    n, k = 5, 12
+    table = (
+        np.eye(k, dtype=bool)[::-1] if photographed != "all pairs" else np.ones((k, k), bool)
+    )
+    pairs = PhotographedPairs.of_table(table)
+    samples = TexelSamples(
+        samples=small_rng.random((n, len(pairs), 3)).astype(np.float32),
+        views=unit(small_rng, n, k),
+        lights=unit(small_rng, n, k),
+        view_seen=small_rng.random((n, k)) < 0.4,
+        light_seen=small_rng.random((n, k)) < 0.8,
+        pairs=pairs,
+        unit=2.0,
+    )
+    reliable = small_rng.random((n, k)) < 0.9
+    block = sample_block(np.arange(n), samples, reliable, 4.0)
+    row = np.repeat(np.arange(n), np.diff(block.first))
+    expected = [
+        (t, i, p)
+        for t in range(n)
+        for p, (i, j) in enumerate(zip(pairs.view, pairs.light, strict=True))
+        if samples.view_seen[t, i] and samples.light_seen[t, j] and reliable[t, j]
+    ]
+    t, view, photograph = np.transpose(expected)
+    np.testing.assert_array_equal(row, t)
+    np.testing.assert_array_equal(block.camera, view)
+    np.testing.assert_array_equal(block.values, samples.samples[t, photograph] / 2)
+    np.testing.assert_array_equal(block.views[row, block.view], samples.views[t, view])
+    light = pairs.light[photograph]
+    np.testing.assert_array_equal(block.lights[row, block.light], samples.lights[t, light])
+    if photographed != "all pairs":
+        assert block.views.shape[1] == np.diff(block.first).max() < k

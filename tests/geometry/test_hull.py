@@ -175,3 +175,17 @@ def test_sizes_and_counts_are_checked():
         visual_hull(views, [good[0], good[1][:90], *good[2:]], RAW)
     with pytest.raises(InputError, match="resolution"):
         HullOptions(resolution=7)
+
+
+def test_one_of_forty_made_silhouettes_may_miss_a_part():
+    """Each of the views carves where it sees nothing; of made ones a few may be wrong."""
+    views = rigs.cameras(80, size=48)
+    silhouettes = [rigs.ball_silhouette(view, samples=2) for view in views]
+    for wrong in (20, 60):
+        silhouettes[wrong][:, 24:] = 0.0
+    options = HullOptions(resolution=32, blur=0.0, smoothing=0, n_triangles=0)
+    mesh, report = visual_hull(views, silhouettes, options, made=True)
+    whole, _ = visual_hull(views, [rigs.ball_silhouette(v, samples=2) for v in views], options)
+    assert mesh.volume == pytest.approx(whole.volume, rel=0.03)
+    assert sorted(np.argsort(report.overlap)[:2]) == [20, 60]
+    assert not report.left_out

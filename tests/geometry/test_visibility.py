@@ -241,6 +241,31 @@ def test_edges_do_not_depend_on_the_strips_that_they_are_found_in(monkeypatch):
     assert 500 < covered.sum() < 700
 
 
+@pytest.mark.parametrize(
+    ("kind", "distortion", "moved"),
+    [
+        ("opencv", (), [0.3, -0.2, 4.0]),
+        ("opencv", (), [2.5, 0.0, 4.0]),  # the ball leaves the image
+        ("opencv", (), [0.0, 0.0, 0.5]),  # the camera is inside of it
+        ("opencv", (0.3, 0.1), [0.3, -0.2, 4.0]),
+        ("orthographic", (), [0.3, -0.2, 4.0]),
+    ],
+)
+def test_pixels_that_cannot_show_the_mesh_are_not_traced_and_miss_nothing(
+    kind, distortion, moved
+):
+    sphere = trimesh.creation.icosphere(2)
+    scene = RayScene(Mesh(sphere.vertices, sphere.faces))
+    pose = np.eye(4)
+    pose[:3, 3] = moved
+    focal = 50.0 if kind == "opencv" else 12.0
+    camera = Camera("v", kind, 40, 33, focal, focal, 20.0, 16.5, pose, distortion)
+    y, x = np.mgrid[:33, :40] + 0.5
+    everywhere = scene.pixel_depths(camera, np.stack([x.ravel(), y.ravel()], axis=1))
+    assert np.array_equal(scene.row_depths(camera, 0, 33), everywhere.reshape(33, 40))
+    assert np.array_equal(scene.row_depths(camera, 7, 12), everywhere.reshape(33, 40)[7:12])
+
+
 def test_threads_of_a_query_are_no_more_than_cores():
     square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]])
     scene = RayScene(square, threads=100_000)

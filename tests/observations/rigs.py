@@ -9,6 +9,8 @@ import numpy as np
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.capture import Capture, Photograph
 from reflfield.capture.lights import Light
+from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.store import create_samples
 from reflfield.observations.texel_samples import TexelSamples, TransformedSamples
 from reflfield.sphere.hemisphere import HemisphereGrid
 
@@ -62,7 +64,22 @@ def texel_samples(rng, n, n_views, n_lights, **changes):
         "light_seen": np.ones((n, n_lights), bool),
         "pairs": np.ones((n_views, n_lights), bool),
     }
-    return TexelSamples(**(arguments | changes))
+    arguments |= changes
+    pairs = PhotographedPairs.of_table(arguments["pairs"])
+    samples = of_photographs(arguments["samples"], pairs)
+    return TexelSamples(**(arguments | {"samples": samples, "pairs": pairs}))
+
+
+def of_photographs(samples, pairs):
+    """Of samples (n, n_views, n_lights, 3) those that were photographed, (n, n_pairs, 3)."""
+    return samples[:, pairs.view, pairs.light]
+
+
+def write_samples(location, capture, samples):
+    """Store of samples (n, n_views, n_lights, 3), those that the capture has photographs of."""
+    pairs = PhotographedPairs.of(capture)
+    stored = create_samples(location, len(samples), pairs)
+    stored[:] = of_photographs(samples, pairs).astype(np.float16)
 
 
 def transformed(rng, n, n_views, n_lights, sides, *, pairs=None, values=None):

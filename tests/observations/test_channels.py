@@ -8,7 +8,8 @@ import pytest
 from reflfield.capture.lights import Light
 from reflfield.observations import frame_resampling
 from reflfield.observations.frame_resampling import CONTINUED, ResamplingOptions, resample
-from reflfield.observations.image_projection import directions_of, pairs_photographed
+from reflfield.observations.image_projection import directions_of
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.observations.texel_reading import (
     LUMINANCE,
@@ -23,7 +24,7 @@ from reflfield.observations.texel_samples import (
 )
 from reflfield.sphere.hemisphere import softened_cosine
 
-from .rigs import dome, hemisphere, texel_samples, tilted_frames, transformed
+from .rigs import dome, hemisphere, texel_samples, tilted_frames, transformed, write_samples
 from .test_resampling import SOLVE, weighted_solution
 
 N = 12
@@ -49,10 +50,9 @@ def reader_of(tmp_path, rng):
         cosine = softened_cosine(local_directions(frames, lights)[..., 2])
         samples = cosine[:, None, :, None] * np.asarray(colour) * np.ones((1, n_views, 1, 1))
         has_colour = np.stack([light.intensity > 0 for light in capture.lights])
-        stored = create_samples(tmp_path / "store", N, n_views, n_lights)
-        stored[:] = np.where(has_colour, samples, np.nan).astype(np.float16)
+        write_samples(tmp_path / "store", capture, np.where(has_colour, samples, np.nan))
         lit = np.full((N, n_lights), not shadowed)
-        seen = Observed(np.ones((N, n_views), bool), lit, pairs_photographed(capture))
+        seen = Observed(np.ones((N, n_views), bool), lit, PhotographedPairs.of(capture))
         return TexelReader(
             store=ObservationStore(tmp_path / "store", seen),
             capture=capture,
@@ -113,7 +113,8 @@ def test_what_is_clipped_everywhere_is_continued_and_counts_a_little(rng):
     """Else nothing is known there, and a node that no texel observed would be black."""
     whole = texel_samples(rng, 2, 6, 7, samples=np.full((2, 6, 7, 3), 0.3, np.float32))
     samples = whole.samples.copy()
-    samples[:, :, :3, 1], samples[1, ..., 2] = np.nan, np.nan
+    under_first_lights = whole.pairs.light < 3
+    samples[:, under_first_lights, 1], samples[1, ..., 2] = np.nan, np.nan
     frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
     found = transformed_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
     nodes = resample(found, (1, 5), 0.03)
@@ -149,7 +150,7 @@ def test_luminance_of_a_lamp_of_one_colour_is_that_under_white_light(reader_of):
     reader = reader_of(4, 12, colour)
     samples = reader.measured(np.arange(N))
     cosine = softened_cosine(local_directions(reader.local_from_world, samples.lights)[..., 2])
-    found = luminance_of(samples, cosine)
+    found = luminance_of(samples, cosine).reshape(N, 4, 12)
     # Halves round to eleven bits.
     expected = np.broadcast_to((cosine * (colour @ LUMINANCE))[:, None], found.shape)
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
@@ -163,7 +164,7 @@ def test_luminance_beside_whole_samples_is_exact_for_one_colour(rng):
     gaps[:, 0] = False
     samples = texel_samples(rng, 3, 4, 5, samples=np.where(gaps, np.nan, values))
     nothing = gaps.all(axis=3)
-    found = luminance_of(samples, np.ones((3, 5), np.float32))
+    found = luminance_of(samples, np.ones((3, 5), np.float32)).reshape(3, 4, 5)
     assert np.isnan(found[nothing]).all()
     np.testing.assert_allclose(found[~nothing], (values @ LUMINANCE)[~nothing], rtol=1e-5)
 
@@ -171,7 +172,7 @@ def test_luminance_beside_whole_samples_is_exact_for_one_colour(rng):
 def test_shade_is_the_mean_of_what_was_measured(reader_of, rng):
     reader = reader_of(4, 6, [0.3, 0.2, 0.1], shadowed=True)
     shade = reader.shade(np.arange(N))
-    samples = reader.measured(np.arange(N)).samples.astype(float)
+    samples = reader.measured(np.arange(N)).samples.reshape(N, 4, 6, 3).astype(float)
     expected = np.nan_to_num(np.cbrt(samples[:, 0]))  # views agree
     assert np.array_equal(shade.weights, 4.0 * ~np.isnan(samples[:, 0]))
     np.testing.assert_allclose(shade.values, expected, rtol=1e-6)
@@ -183,8 +184,8 @@ def test_samples_of_which_nothing_was_measured_are_counted(reader_of):
     assert usual.unmeasured == 0
     stored = reader.store.samples
     values = stored[:]
-    values[2, 1] = np.nan
-    changed = create_samples(reader.store.location, N, 4, 6)
+    values[2, 6:12] = np.nan
+    changed = create_samples(reader.store.location, N, reader.store.observed.pairs)
     changed[:] = values
     found = reader.count_fitted(np.arange(N))
     n_counted = int((reader.transformed(np.array([2])).light_weights > 0).sum())

@@ -10,17 +10,16 @@ from reflfield.errors import ShapeError
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.frame_refinement import _add_texel, _gains, _own_function, refined_frames
 from reflfield.observations.frame_resampling import ResamplingOptions
-from reflfield.observations.image_projection import pairs_photographed
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
     ObservationStore,
     Observed,
-    create_samples,
     open_samples,
 )
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.sphere.hemisphere import HemisphereGrid, place_directions, softened_cosine
 
-from .rigs import dome, interpolated, tilted_frames
+from .rigs import dome, interpolated, tilted_frames, write_samples
 
 N = 60
 SIDES = (7, 7)
@@ -56,7 +55,7 @@ def planted(model, tmp_path, rng):
     capture = dome(14, 15, missing={(1, 2), (3, 4)})
     truth = tilted_frames(rng, N)
     seen = Observed(
-        rng.random((N, 14)) < 0.7, rng.random((N, 15)) < 0.8, pairs_photographed(capture)
+        rng.random((N, 14)) < 0.7, rng.random((N, 15)) < 0.8, PhotographedPairs.of(capture)
     )
     reader = TexelReader(
         store=ObservationStore(tmp_path / "store", seen),
@@ -66,18 +65,16 @@ def planted(model, tmp_path, rng):
         sides=SIDES,
         options=ResamplingOptions(),
     )
-    stored = create_samples(tmp_path / "store", N, 14, 15)
-    stored[:] = 0
+    write_samples(tmp_path / "store", capture, np.zeros((N, 14, 15, 3)))
     taps = reader.transformed(np.arange(N))
     parts = model.table.reshape(2, 49, 49, 2, 3)[model.cluster]
     nodes = parts[..., 0, :] + model.coefficients[:, None, None] * parts[..., 1, :]
     lights = reader.luminance(np.arange(N)).lights
     cosine = softened_cosine(lights[..., 2])[:, None, :, None]
-    observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs
+    observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs.table
     # What is not observed must have no say, whatever it holds.
-    stored[:] = np.where(
-        observed[..., None], cosine * interpolated(taps, nodes) ** 3, 7.0
-    ).astype(np.float16)
+    values = np.where(observed[..., None], cosine * interpolated(taps, nodes) ** 3, 7.0)
+    write_samples(tmp_path / "store", capture, values)
     off = Rotation.from_rotvec(SPREAD * rng.normal(size=(N, 3))).as_matrix()
     return reader.rotated((off @ truth).astype(np.float32)), truth
 

@@ -18,11 +18,11 @@ from reflfield.observations.image_projection import (
     directions_of,
     facing_irradiance,
     look_into,
-    pairs_photographed,
+    project_chunk,
     project_photographs,
-    project_views,
     sample_bilinear,
 )
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import ObservationStore, Observed
 from reflfield.util.blocks import Blocks, Scheduler
 
@@ -70,9 +70,10 @@ def project(tmp_path):
         projection = Projection(capture, positions, visible, folder / "store")
         project_photographs(projection, Blocks(Scheduler(), folder / "blocks"))
         lights = np.ones((len(positions), capture.n_lights), bool)
-        observed = Observed(visible, lights, pairs_photographed(capture))
+        observed = Observed(visible, lights, PhotographedPairs.of(capture))
         stored = ObservationStore(folder / "store", observed)
-        return stored.read(slice(None)).astype(np.float64) * stored.unit
+        samples = stored.read(slice(None)).astype(np.float64) * stored.unit
+        return observed.pairs.as_product(samples, np.nan)
 
     return run
 
@@ -165,18 +166,22 @@ class TestProjection:
         assert np.array_equal(project(capture_of(images, lights), [[0, 0, 0]])[0, 0, :, 0],
                               np.arange(70))  # fmt: skip
 
-    def test_unseen_and_unphotographed_stay_zero(self, capture_of, project):
+    def test_unseen_stay_zero_and_of_what_was_not_photographed_there_is_nothing(
+        self, capture_of, project
+    ):
         images = np.ones((2, 2, HEIGHT, WIDTH, 3))
         lights = [Light(f"l{j}", "directional") for j in range(2)]
         visible = np.array([[True, True], [False, True], [False, False]])
         got = project(capture_of(images, lights, {(1, 0)}), np.zeros((3, 3)), visible)
-        expected = visible[:, :, None] & np.array([[True, True], [False, True]])
-        assert np.array_equal(got[..., 0], expected)
+        expected = np.repeat(visible[:, :, None], 2, axis=2).astype(float)
+        expected[:, 1, 0] = np.nan
+        assert np.array_equal(got[..., 0], expected, equal_nan=True)
 
     def test_view_without_photographs(self, capture_of, project):
         images = np.ones((2, 1, HEIGHT, WIDTH, 3))
         capture = capture_of(images, [Light("l0", "directional")], {(0, 0)})
-        assert project(capture, np.zeros((1, 3)))[0, :, 0, 0].tolist() == [0, 1]
+        got = project(capture, np.zeros((1, 3)))[0, :, 0, 0]
+        assert np.array_equal(got, [np.nan, 1], equal_nan=True)
 
     def test_light_without_blue_measures_none_and_a_spot_that_misses_gives_none(
         self, capture_of, project
@@ -268,7 +273,7 @@ class TestClipping:
             visible = np.ones((len(positions), 1), bool)
             projection = Projection(capture, positions, visible, tmp_path / "store")
             projected = project_photographs(projection, Blocks(Scheduler(), tmp_path / "b"))
-            observed = Observed(visible, np.ones_like(visible), np.ones((1, 1), bool))
+            observed = Observed(visible, np.ones_like(visible), PhotographedPairs.product(1, 1))
             stored = ObservationStore(tmp_path / "store", observed)
             values = stored.read(slice(None)).astype(np.float64) * stored.unit
             return values.reshape(HEIGHT, WIDTH, 3), projected, stored
@@ -336,8 +341,8 @@ class TestDirections:
         assert directions_of(capture, np.zeros((2, 3)))[1].tolist() == [[[0, 0, 1]]] * 2
 
     def test_pairs(self):
-        pairs = pairs_photographed(dome(2, 3, missing={(1, 2)}))
-        assert pairs.tolist() == [[True, True, True], [True, True, False]]
+        pairs = PhotographedPairs.of(dome(2, 3, missing={(1, 2)}))
+        assert pairs.table.tolist() == [[True, True, True], [True, True, False]]
 
 
 def test_camera_that_images_nothing_is_named(capture_of, tmp_path):
@@ -347,9 +352,9 @@ def test_camera_that_images_nothing_is_named(capture_of, tmp_path):
     projection = Projection(
         behind, np.array([[0, 0, 5.0]]), np.ones((1, 1), bool), tmp_path / "s"
     )
-    store.create_samples(projection.location, *projection.shape)
+    store.create_samples(projection.location, 1, projection.pairs)
     with pytest.raises(InputError, match="pixels"):
-        project_views(projection, range(1))
+        project_chunk(projection, range(1))
 
 
 def test_the_photographs_looked_into_show_every_light(capture_of, tmp_path):

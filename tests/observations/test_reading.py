@@ -5,13 +5,13 @@ import pytest
 
 from reflfield.capture.lights import Light
 from reflfield.observations.frame_resampling import ResamplingOptions
-from reflfield.observations.image_projection import pairs_photographed
-from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
+from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.store import ObservationStore, Observed, note_gaps
 from reflfield.observations.texel_reading import NodeColumns, TexelReader, grid_sides
 from reflfield.observations.texel_samples import transform
 from reflfield.sphere.hemisphere import HemisphereGrid
 
-from .rigs import dome, tilted_frames
+from .rigs import dome, tilted_frames, write_samples
 
 SIDES = (3, 5)
 
@@ -22,13 +22,12 @@ def reader_of(tmp_path, rng):
 
     def make(capture, samples, *, domain="linear", sides=SIDES, **observed):
         n = len(samples)
-        stored = create_samples(tmp_path / "store", n, capture.n_views, capture.n_lights)
-        stored[:] = samples.astype(np.float16)
+        write_samples(tmp_path / "store", capture, samples)
         note_gaps(tmp_path / "store", float(np.isnan(samples).mean()))
         seen = {
             "views": np.ones((n, capture.n_views), bool),
             "lights": np.ones((n, capture.n_lights), bool),
-            "pairs": pairs_photographed(capture),
+            "pairs": PhotographedPairs.of(capture),
         }
         return TexelReader(
             store=ObservationStore(tmp_path / "store", Observed(**(seen | observed))),
@@ -63,7 +62,7 @@ class TestReader:
     def test_values_are_samples_over_cosines(self, reader, rng):
         texels = np.array([31, 4])
         got = reader.transformed(texels)
-        stored = reader.store.read(texels).astype(float)
+        stored = reader.store.read(texels).reshape(2, 6, 7, 3).astype(float)
         for i, t in enumerate(texels):
             for j, light in enumerate(reader.capture.lights):
                 towards = light.position - reader.positions[t]
@@ -134,7 +133,7 @@ class TestReader:
         assert reader.n_texels == 40
         assert reader.n_pairs == 9 * 25
         values = reader.transformed(np.arange(40)).values.nbytes
-        assert reader.sample_bytes_per_texel * 40 > values
+        assert reader.product_bytes_per_texel * 40 > values
 
 
 class TestColumns:
@@ -174,9 +173,11 @@ class TestLuminance:
         reader = reader_of(capture, rng.random((9, 5, 4, 3)), views=views, lights=lights)
         texels = np.array([8, 1, 3])
         found = reader.luminance(texels)
-        seen = views[texels][:, :, None] & lights[texels][:, None] & pairs_photographed(capture)
+        pairs = PhotographedPairs.of(capture)
+        seen = views[texels][:, :, None] & lights[texels][:, None] & pairs.table
         np.testing.assert_array_equal(np.isfinite(found.samples), seen)
-        red, green, blue = np.moveaxis(reader.store.read(texels).astype(float), 3, 0)
+        stored = pairs.as_product(reader.store.read(texels).astype(float), np.nan)
+        red, green, blue = np.moveaxis(stored, 3, 0)
         expected = 0.2126 * red + 0.7152 * green + 0.0722 * blue
         eps = np.finfo(np.float32).eps
         np.testing.assert_allclose(found.samples[seen], expected[seen], rtol=4 * eps)

@@ -8,17 +8,17 @@ from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.frame_resampling import ResamplingOptions
-from reflfield.observations.image_projection import directions_of, pairs_photographed
+from reflfield.observations.image_projection import directions_of
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
     ObservationStore,
     Observed,
-    create_samples,
     open_samples,
 )
 from reflfield.observations.texel_reading import TexelReader
 from tests.synthetic_fields import baked_field, blinn_phong, square_surface
 
-from .rigs import dome
+from .rigs import dome, write_samples
 
 
 @pytest.fixture
@@ -38,13 +38,13 @@ def reader_of(field, tmp_path, rng):
     own = own.reshape(n, 5, 6, 3)
 
     def make(factor):
-        stored = create_samples(tmp_path / "store", n, 5, 6)
         seen = Observed(
-            rng.random((n, 5)) < 0.7, rng.random((n, 6)) < 0.7, pairs_photographed(capture)
+            rng.random((n, 5)) < 0.7, rng.random((n, 6)) < 0.7, PhotographedPairs.of(capture)
         )
-        observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs
+        observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs.table
         # What is not observed must not count, whatever it holds.
-        stored[:] = np.where(observed[..., None], factor * own, 1e3).astype(np.float16)
+        values = np.where(observed[..., None], factor * own, 1e3)
+        write_samples(tmp_path / "store", capture, values)
         return TexelReader(
             store=ObservationStore(tmp_path / "store", seen),
             capture=capture,
@@ -76,9 +76,8 @@ def test_values_not_measured_do_not_count(field, reader_of, rng):
     stored[:] = values
     found = sample_error(field, reader, np.arange(field.n_texels))
     assert found.linear == pytest.approx(0.5, abs=2 * HALF)
-    seen = reader.store.observed
-    observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs
-    assert found.n_samples == (observed & ~np.isnan(values).all(axis=3)).sum()
+    observed = reader.store.observed.of_texels(slice(None))
+    assert found.n_samples == (observed & ~np.isnan(values).all(axis=2)).sum()
 
 
 def test_error_is_relative_to_the_samples(field, reader_of):
@@ -94,7 +93,7 @@ def test_psnr_is_that_of_the_radiances_as_they_are_shown(field, reader_of):
     reader = reader_of(1.5)
     found = sample_error(field, reader, np.arange(field.n_texels))
     seen = reader.store.observed
-    t, i, j = np.nonzero(seen.views[:, :, None] & seen.lights[:, None] & seen.pairs)
+    t, i, j = np.nonzero(seen.views[:, :, None] & seen.lights[:, None] & seen.pairs.table)
     views, lights = directions_of(reader.capture, reader.positions)
     own = evaluate(field, t, views[t, i], lights[t, j])
     irradiance = np.stack(

@@ -6,10 +6,12 @@ import shutil
 
 import pytest
 
+from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import create_samples
 from reflfield.pipeline.cache import RECORD, StageFolder
 
 OPTIONS = {"side": 5}
+FOUR = PhotographedPairs.product(2, 2)
 
 
 def write_sum(folder):
@@ -176,7 +178,7 @@ def test_what_is_wrong_outside_of_the_folder_is_computed_again(other, caplog):
 
 def write_store(folder):
     """A stage with a store of two chunks."""
-    array = create_samples(folder / "samples", 5, 2, 2)
+    array = create_samples(folder / "samples", 5, FOUR)
     array[:] = 3
     return {}
 
@@ -185,7 +187,7 @@ def write_store(folder):
 def test_a_damaged_chunk_is_computed_again(tmp_path, caplog, damage):
     stages = StageFolder(tmp_path)
     folder = stages.run("observations", write_store)
-    chunk = folder / "samples" / "c" / "0" / "0" / "0" / "0"
+    chunk = folder / "samples" / "c" / "0" / "0" / "0"
     if damage == "one bit":  # written now, as whatever damages it would
         data = bytearray(chunk.read_bytes())
         data[-9] ^= 1
@@ -196,7 +198,7 @@ def test_a_damaged_chunk_is_computed_again(tmp_path, caplog, damage):
     again.run("observations", write_store)
     assert not again.records[0].reused
     assert "samples/c" in caplog.text
-    assert (create_samples(folder / "samples", 5, 2, 2)[:] == 3).all()
+    assert (create_samples(folder / "samples", 5, FOUR)[:] == 3).all()
     StageFolder(tmp_path).run("observations", refused)
 
 

@@ -70,10 +70,15 @@ def silhouettes_section(
     -------
     Section
     """
-    seen = [(_agreement(view), _overlay(view)) for view in views]
-    seen.sort(key=lambda entry: (entry[0][1], entry[0][0]))
+    rows, shown = [], list[tuple[tuple[float, str], SilhouetteView]]()
+    for view in views:
+        rows.append(_agreement(view))
+        # Pictures of all views of a large capture would take long, and memory.
+        shown.append(((rows[-1][1], view.name), view))
+        shown = sorted(shown, key=lambda entry: entry[0])[:max_pictures]
+    rows.sort(key=lambda row: (row[1], row[0]))
     panels = tuple(
-        Panel(picture, f"{row[0]} · IoU {row[1]:.3f}") for row, picture in seen[:max_pictures]
+        Panel(_overlay(view), f"{name} · IoU {overlap:.3f}") for (overlap, name), view in shown
     )
     figure = Figure(
         panels,
@@ -97,12 +102,15 @@ def silhouettes_section(
                 f"{100 * missing:.2f}",
                 f"{100 * beyond:.2f}",
             )
-            for (name, iou, missing, beyond), _ in seen
+            for name, iou, missing, beyond in rows
         ),
         "Agreement per view: intersection over union; area missing from the hull and area "
         "beyond the silhouette, in percent of the silhouette.",
     )
     intro = f"Agreement of the silhouettes with the hull. Silhouettes: {origin or 'given'}."
+    if rows:
+        overlaps = [row[1] for row in rows]
+        intro += f" IoU: median {np.median(overlaps):.3f}, least {min(overlaps):.3f}."
     return Section("Silhouettes and hull", intro, (figure, table))
 
 

@@ -81,8 +81,7 @@ def compression_section(parts: Mapping[str, int], raw_bytes: int) -> Section:
     parts : mapping of name to bytes
         Parts of the field file, all of it.
     raw_bytes : int
-        Samples of the capture as half floats:
-        ``n_texels * n_views * n_lights * 3 * 2``.
+        Samples of the capture as half floats: ``n_texels * n_photographs * 3 * 2``.
 
     Returns
     -------
