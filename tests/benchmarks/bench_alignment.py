@@ -111,9 +111,11 @@ def maxima(abrdfs, target, planted):
     number of peaks finds; the higher counts.
     """
     source, aim = couple(abrdfs.astype(np.float64)), couple(target[None].astype(np.float64))
-    found = search(couple(abrdfs), couple(target[None]), n_peaks=16, margins=False).rotations
+    rotations = search(
+        couple(abrdfs), couple(target[None]), n_peaks=16, margins=False
+    ).rotations
     series, rows = spectrum(source, aim.units()), np.arange(len(abrdfs))
-    climbed = [follow(series, rows, start, 30) for start in (found, planted)]
+    climbed = [follow(series, rows, start, 30) for start in (rotations, planted)]
     higher = climbed[0][1][:, 0] >= climbed[1][1][:, 0]
     best = np.where(higher[:, None, None], climbed[0][0], climbed[1][0])
     return np.stack([best, follow(series, rows, best @ HALF_TURN, 30)[0]], axis=1)

@@ -178,7 +178,7 @@ class TestNormalEquations:
         model = planted_model(rng, 30, n_clusters=1, n_components=0)
         samples = measured(empty_samples(rng, 30, 7, 6), model, rng, 0.1)
         problem = problem_of(samples, model, pool, smoothness=0.01)
-        found = problem.solve(np.zeros_like(model.table), 200)[0].reshape(81, 3)
+        table = problem.solve(np.zeros_like(model.table), 200)[0].reshape(81, 3)
         a, b = interpolation(samples.view_taps, 9), interpolation(samples.light_taps, 9)
         both = np.einsum("tiv,tjl->tijvl", a, b).reshape(-1, 81)
         weights = sample_weights(samples).ravel()
@@ -189,7 +189,7 @@ class TestNormalEquations:
         normal = both.T @ (weights[:, None] * both) + strength * (rough + 0.01 * np.eye(81))
         right = both.T @ (weights[:, None] * samples.values.reshape(-1, 3))
         # Steps stop at a residual of 1e-5; the worst nodes see little.
-        error = np.abs(found - np.linalg.solve(normal, right)).max()
+        error = np.abs(table - np.linalg.solve(normal, right)).max()
         assert error < 1e-5 * np.linalg.cond(normal)
         assert np.linalg.cond(normal) < 1e3
 
@@ -219,7 +219,7 @@ class TestCoefficients:
         precision = np.array([[2.0, 0.3], [0.3, 1.0]])
         model = replace(model, precision=np.stack([precision, 3 * precision]))
         samples = measured(empty_samples(rng, 12, 6, 5, gaps=gaps), model, rng, 0.1)
-        found, squares = solve_coefficients(samples, model.cluster, model, pool)
+        coefficients, squares = solve_coefficients(samples, model.cluster, model, pool)
         columns = [
             predicted(samples, replace(model, coefficients=np.tile(row, (12, 1))))
             for row in np.array([[0, 0], [1, 0], [0, 1.0]])
@@ -233,7 +233,7 @@ class TestCoefficients:
             expected = np.linalg.lstsq(
                 np.vstack([design, prior]), np.append(rest, [0, 0]), rcond=None
             )[0]
-            assert np.abs(found[t] - expected).max() < rounding(np.float32, 30, scale=2)
+            assert np.abs(coefficients[t] - expected).max() < rounding(np.float32, 30, scale=2)
             left = ((rest - design @ expected) ** 2).sum()
             assert np.isclose(squares[t, 0], left, rtol=1e-4)  # what is left of float32 sums
             full = design.T @ design
@@ -246,8 +246,10 @@ class TestCoefficients:
         model = planted_model(rng, 40)
         samples = measured(empty_samples(rng, 40, 12, 12), model, rng, 0.0)
         weak = replace(model, precision=1e-6 * model.precision)
-        found, _ = solve_coefficients(samples, model.cluster, weak, pool)
-        assert np.abs(found - model.coefficients).max() < 1e-4  # float32, a few hundred samples
+        coefficients, _ = solve_coefficients(samples, model.cluster, weak, pool)
+        assert (
+            np.abs(coefficients - model.coefficients).max() < 1e-4
+        )  # float32, a few hundred samples
 
     @pytest.mark.stability
     def test_texel_without_samples(self, rng, pool):
@@ -255,27 +257,27 @@ class TestCoefficients:
         samples = measured(empty_samples(rng, 5, 6, 5), model, rng, 0.1)
         samples.view_weights[1] = 0
         samples.light_weights[2] = 0
-        found, squares = solve_coefficients(samples, model.cluster, model, pool)
-        assert not found[1:3].any()
+        coefficients, squares = solve_coefficients(samples, model.cluster, model, pool)
+        assert not coefficients[1:3].any()
         assert not squares[1:3].any()
-        assert np.isfinite(found).all()
+        assert np.isfinite(coefficients).all()
 
     @pytest.mark.stability
     def test_one_sample_for_many_components(self, rng, pool):
         model = planted_model(rng, 3, n_components=8)
         samples = measured(empty_samples(rng, 3, 1, 1), model, rng, 0.1)
         samples.view_weights[:] = samples.light_weights[:] = samples.pairs[:] = 1
-        found, _ = solve_coefficients(samples, model.cluster, model, pool)
-        assert np.isfinite(found).all()
-        fitted = predicted(samples, replace(model, coefficients=found))
-        before = predicted(samples, replace(model, coefficients=0 * found))
+        coefficients, _ = solve_coefficients(samples, model.cluster, model, pool)
+        assert np.isfinite(coefficients).all()
+        fitted = predicted(samples, replace(model, coefficients=coefficients))
+        before = predicted(samples, replace(model, coefficients=0 * coefficients))
         assert np.abs(fitted - samples.values).sum() < np.abs(before - samples.values).sum()
 
     def test_without_components(self, rng, pool, rounding):
         model = planted_model(rng, 6, n_components=0)
         samples = measured(empty_samples(rng, 6, 5, 4), model, rng, 0.1)
-        found, squares = solve_coefficients(samples, model.cluster, model, pool)
-        assert found.shape == (6, 0)
+        coefficients, squares = solve_coefficients(samples, model.cluster, model, pool)
+        assert coefficients.shape == (6, 0)
         rest = (
             sample_weights(samples)[..., None]
             * (samples.values - predicted(samples, model)) ** 2
@@ -291,31 +293,31 @@ class TestNormalised:
         mixed = model.coefficients @ np.array([[2, 1], [0, 0.5]]) + [3, -1]
         model = replace(model, coefficients=mixed.astype(np.float32))
         chosen = np.arange(0, 60, 2)
-        found = normalised(model, 0.04, chosen)
+        white = normalised(model, 0.04, chosen)
         samples = empty_samples(rng, 60, 3, 3)
-        one, two = predicted(samples, model), predicted(samples, found)
+        one, two = predicted(samples, model), predicted(samples, white)
         assert np.abs(one - two).max() < 1e-5 * np.abs(one).max()  # float32, sums of three
         for c in range(2):
             members = chosen[model.cluster[chosen] == c]
-            assert np.abs(found.coefficients[members].mean(axis=0)).max() < 1e-5
-            assert np.allclose(np.cov(found.coefficients[members].T), np.eye(2), atol=1e-5)
-            assert np.allclose(found.precision[c], 0.04 * np.eye(2))
+            assert np.abs(white.coefficients[members].mean(axis=0)).max() < 1e-5
+            assert np.allclose(np.cov(white.coefficients[members].T), np.eye(2), atol=1e-5)
+            assert np.allclose(white.precision[c], 0.04 * np.eye(2))
 
     @pytest.mark.stability
     def test_too_few_members_change_nothing(self, rng):
         model = planted_model(rng, 8, n_clusters=3, n_components=4)
-        found = normalised(model, 0.1, np.arange(8))
-        assert np.array_equal(found.table, model.table)
-        assert np.array_equal(found.coefficients, model.coefficients)
+        same = normalised(model, 0.1, np.arange(8))
+        assert np.array_equal(same.table, model.table)
+        assert np.array_equal(same.coefficients, model.coefficients)
 
     @pytest.mark.stability
     @pytest.mark.parametrize("value", [0.0, 3.0])
     def test_coefficients_that_are_all_alike(self, rng, value):
         model = planted_model(rng, 50)
         model = replace(model, coefficients=np.full((50, 2), value, np.float32))
-        found = normalised(model, 0.1, np.arange(50))
-        assert np.isfinite(found.coefficients).all()
-        assert np.isfinite(found.table).all()
+        white = normalised(model, 0.1, np.arange(50))
+        assert np.isfinite(white.coefficients).all()
+        assert np.isfinite(white.table).all()
 
     @pytest.mark.stability
     @pytest.mark.parametrize("scale", [1e-12, 1e12])
@@ -363,13 +365,13 @@ class TestFit:
         start = disturbed(model, rng)
         last = {}
         for sigma in (0.1, 0.01):
-            found = fitted(measured(empty, model, rng, sigma), start, rounds=8)
-            assert len(found.residuals) == 8
-            assert (np.diff(found.residuals) < 1e-3 * sigma).all()
-            last[sigma] = found.residuals[-1]
+            fit = fitted(measured(empty, model, rng, sigma), start, rounds=8)
+            assert len(fit.residuals) == 8
+            assert (np.diff(fit.residuals) < 1e-3 * sigma).all()
+            last[sigma] = fit.residuals[-1]
             # Some 40 samples of 3 channels a texel, 2 coefficients and a share of the basis.
             assert 0.9 * sigma < last[sigma] < 1.15 * sigma
-            error = predicted(empty, found) - predicted(empty, model)
+            error = predicted(empty, fit) - predicted(empty, model)
             weights = sample_weights(empty)[..., None]
             assert np.sqrt((weights * error**2).sum() / (3 * weights.sum())) < 0.5 * sigma
 
@@ -388,9 +390,9 @@ class TestFit:
         """256 texels shape the basis; the other 144 are fitted with it."""
         model = planted_model(rng, 400)
         samples = measured(empty_samples(rng, 400, 6, 6), model, rng, 0.02)
-        found = fitted(samples, disturbed(model, rng), max_bytes=1, rounds=6)
+        fit = fitted(samples, disturbed(model, rng), max_bytes=1, rounds=6)
         error = np.sqrt(
-            ((predicted(samples, found) - predicted(samples, model)) ** 2).mean((1, 2, 3))
+            ((predicted(samples, fit) - predicted(samples, model)) ** 2).mean((1, 2, 3))
         )
         # Noise 0.02 on about 23 x 3 samples; each texel must be far nearer than the spread of
         # 0.3 |coefficients| that it would keep without coefficients.
@@ -403,9 +405,9 @@ class TestFit:
         observed = np.arange(0, 40, 2)
         hidden = replace(samples, values=samples.values.copy())
         hidden.values[1::2] = np.nan
-        found = fitted(hidden, disturbed(model, rng), observed=observed, rounds=2)
-        assert np.isfinite(found.table).all()
-        assert np.isfinite(found.coefficients).all()
+        fit = fitted(hidden, disturbed(model, rng), observed=observed, rounds=2)
+        assert np.isfinite(fit.table).all()
+        assert np.isfinite(fit.coefficients).all()
 
     @pytest.mark.stability
     @pytest.mark.parametrize("exponent", [-40, -10, 40])
@@ -433,17 +435,17 @@ class TestFit:
         empty = empty_samples(rng, 60, 1 if sides[0] == 1 else 6, 6, sides)
         empty.view_weights[:] = empty.pairs[:] = 1
         samples = measured(empty, model, rng, 0.01)
-        found = fitted(samples, disturbed(model, rng), rounds=6)
-        assert found.table.shape == model.table.shape
-        assert found.residuals[-1] < 0.02
+        fit = fitted(samples, disturbed(model, rng), rounds=6)
+        assert fit.table.shape == model.table.shape
+        assert fit.residuals[-1] < 0.02
 
     @pytest.mark.stability
     def test_without_components(self, rng):
         model = planted_model(rng, 30, n_components=0)
         samples = measured(empty_samples(rng, 30, 8, 8), model, rng, 0.01)
-        found = fitted(samples, disturbed(model, rng), rounds=3, iterations=30)
-        assert found.coefficients.shape == (30, 0)
-        assert 0.008 < found.residuals[-1] < 0.012
+        fit = fitted(samples, disturbed(model, rng), rounds=3, iterations=30)
+        assert fit.coefficients.shape == (30, 0)
+        assert 0.008 < fit.residuals[-1] < 0.012
 
     @pytest.mark.stability
     def test_clusters_without_members_and_texels_without_samples(self, rng):
@@ -452,10 +454,10 @@ class TestFit:
         model.cluster[:2] = 1
         samples = measured(empty_samples(rng, 30, 6, 6), model, rng, 0.05)
         samples.view_weights[5] = 0
-        found = fitted(samples, disturbed(model, rng), rounds=3)
-        assert np.isfinite(found.table).all()
-        assert not found.coefficients[5].any()
-        assert np.isfinite(found.residuals).all()
+        fit = fitted(samples, disturbed(model, rng), rounds=3)
+        assert np.isfinite(fit.table).all()
+        assert not fit.coefficients[5].any()
+        assert np.isfinite(fit.residuals).all()
 
     @pytest.mark.stability
     @pytest.mark.parametrize("fill", ["values", "weights"])
@@ -464,10 +466,10 @@ class TestFit:
         samples = empty_samples(rng, 20, 5, 5)
         if fill == "weights":
             samples.light_weights[:] = 0
-        found = fitted(samples, disturbed(model, rng), rounds=2)
-        assert np.isfinite(found.table).all()
-        assert np.isfinite(found.coefficients).all()
-        assert found.residuals[-1] < 0.05
+        fit = fitted(samples, disturbed(model, rng), rounds=2)
+        assert np.isfinite(fit.table).all()
+        assert np.isfinite(fit.coefficients).all()
+        assert fit.residuals[-1] < 0.05
 
     @pytest.mark.stability
     def test_fewer_samples_than_coefficients(self, rng):
@@ -476,9 +478,9 @@ class TestFit:
         empty = empty_samples(rng, 100, 2, 1)
         empty.view_weights[:] = empty.light_weights[:] = 0.3
         empty.pairs[:] = 1
-        found = fitted(measured(empty, model, rng, 0.05), disturbed(model, rng), rounds=4)
-        assert np.isfinite(found.coefficients).all()
-        assert max(found.residuals) < 1
+        fit = fitted(measured(empty, model, rng, 0.05), disturbed(model, rng), rounds=4)
+        assert np.isfinite(fit.coefficients).all()
+        assert max(fit.residuals) < 1
 
     def test_nothing_observed_is_refused(self, rng):
         samples = empty_samples(rng, 3, 2, 2)
@@ -521,11 +523,11 @@ def test_fit_from_a_grid_does_not_depend_on_the_unit(rng, scale):
     scaled = replace(grid, table=table, coefficients=np.float32(scale) * grid.coefficients)
     in_unit = replace(samples, values=np.float32(scale) * samples.values)
     options = SampleFitOptions(rounds=2, iterations=4)
-    found = [
+    fits = [
         fit_basis(lambda t, s=s: part(s, t), of_usual_size(start), np.arange(60), 1000, options)
         for start, s in ((grid, samples), (scaled, in_unit))
     ]
-    np.testing.assert_array_equal(found[1].table, np.float32(scale) * found[0].table)
+    np.testing.assert_array_equal(fits[1].table, np.float32(scale) * fits[0].table)
 
 
 def bounded_case(rng, spread):
@@ -570,8 +572,8 @@ def test_a_texel_is_nowhere_much_brighter_than_seen(rng, pool):
     top = np.maximum(samples.values.max(axis=(1, 2)), MOST_OF_MEAN)
     highest = {}
     for bounded in (False, True):
-        found, _ = solve_coefficients(samples, cluster, model, pool, bounded=bounded)
-        at_nodes = parts[:, 0] + np.einsum("tk,nkc->tnc", found, parts[:, 1:])
+        coefficients, _ = solve_coefficients(samples, cluster, model, pool, bounded=bounded)
+        at_nodes = parts[:, 0] + np.einsum("tk,nkc->tnc", coefficients, parts[:, 1:])
         highest[bounded] = (at_nodes.max(axis=1) - top).max()
     assert highest[False] > 1.0
     assert highest[True] < 1e-5  # rounding in float32

@@ -115,8 +115,8 @@ def test_what_is_clipped_everywhere_is_continued_and_counts_a_little(rng):
     samples = whole.samples.copy()
     samples[:, :, :3, 1], samples[1, ..., 2] = np.nan, np.nan
     frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
-    found = transformed_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
-    nodes = resample(found, (1, 5), 0.03)
+    clipped = transformed_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
+    nodes = resample(clipped, (1, 5), 0.03)
     weights = nodes.weights[:, 0]
     zenith = 12  # of 5 x 5, amid the first lights
     assert weights[0, zenith, 1] == np.float32(CONTINUED)
@@ -134,13 +134,13 @@ def test_values_not_measured_against_a_weighted_solve(rng, monkeypatch, rounding
     values = np.where(measured, whole.values, np.float32(77))
     gaps = replace(whole, values=values, channels=measured @ CHANNEL_BITS)
     monkeypatch.setattr(frame_resampling, "FILLING_SWEEPS", 300)
-    found = resample(gaps, (5, 5), 0.3)
+    nodes = resample(gaps, (5, 5), 0.3)
     for t in range(2):
         for c in range(3):
             pairs = measured[t, ..., c].astype(np.float32)
             of_channel = replace(whole, pairs=pairs)
             expected = weighted_solution(of_channel, (5, 5), 0.3, t)[..., c]
-            error = np.abs(found.values[t, ..., c] - expected).max()
+            error = np.abs(nodes.values[t, ..., c] - expected).max()
             assert error < rounding(np.float32, **SOLVE, scale=3)
 
 
@@ -149,10 +149,10 @@ def test_luminance_of_a_lamp_of_one_colour_is_that_under_white_light(reader_of):
     reader = reader_of(4, 12, colour)
     samples = reader.measured(np.arange(N))
     cosine = softened_cosine(local_directions(reader.local_from_world, samples.lights)[..., 2])
-    found = luminance_of(samples, cosine)
+    luminance = luminance_of(samples, cosine)
     # Halves round to eleven bits.
-    expected = np.broadcast_to((cosine * (colour @ LUMINANCE))[:, None], found.shape)
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
+    expected = np.broadcast_to((cosine * (colour @ LUMINANCE))[:, None], luminance.shape)
+    np.testing.assert_allclose(luminance, expected, rtol=2e-3, atol=1e-6)
 
 
 def test_luminance_beside_whole_samples_is_exact_for_one_colour(rng):
@@ -163,9 +163,9 @@ def test_luminance_beside_whole_samples_is_exact_for_one_colour(rng):
     gaps[:, 0] = False
     samples = texel_samples(rng, 3, 4, 5, samples=np.where(gaps, np.nan, values))
     nothing = gaps.all(axis=3)
-    found = luminance_of(samples, np.ones((3, 5), np.float32))
-    assert np.isnan(found[nothing]).all()
-    np.testing.assert_allclose(found[~nothing], (values @ LUMINANCE)[~nothing], rtol=1e-5)
+    luminance = luminance_of(samples, np.ones((3, 5), np.float32))
+    assert np.isnan(luminance[nothing]).all()
+    np.testing.assert_allclose(luminance[~nothing], (values @ LUMINANCE)[~nothing], rtol=1e-5)
 
 
 def test_shade_is_the_mean_of_what_was_measured(reader_of, rng):
@@ -186,7 +186,7 @@ def test_samples_of_which_nothing_was_measured_are_counted(reader_of):
     values[2, 1] = np.nan
     changed = create_samples(reader.store.location, N, 4, 6)
     changed[:] = values
-    found = reader.count_fitted(np.arange(N))
+    counts = reader.count_fitted(np.arange(N))
     n_counted = int((reader.transformed(np.array([2])).light_weights > 0).sum())
-    assert found.unmeasured == n_counted
-    assert found.fitted == usual.fitted - n_counted
+    assert counts.unmeasured == n_counted
+    assert counts.fitted == usual.fitted - n_counted

@@ -236,8 +236,8 @@ def dense_solution(samples, sides, smoothness, texel):
         normal.append(a.T @ (w[:, None] * a) + smoothness_precision(side, smoothness))
         right.append(a.T * w)
     values = samples.values[texel].reshape(-1, 3)
-    found = np.linalg.solve(np.kron(*normal), np.kron(*right) @ values)
-    return found.reshape(sides[0] ** 2, sides[1] ** 2, 3)
+    solution = np.linalg.solve(np.kron(*normal), np.kron(*right) @ values)
+    return solution.reshape(sides[0] ** 2, sides[1] ** 2, 3)
 
 
 def weighted_solution(samples, sides, smoothness, texel):
@@ -255,8 +255,8 @@ def weighted_solution(samples, sides, smoothness, texel):
     weights = np.outer(samples.view_weights[texel], samples.light_weights[texel])
     both, seen = np.kron(*matrices), (weights * samples.pairs).ravel()[:, None]
     values = samples.values[texel].reshape(-1, 3)
-    found = np.linalg.solve(both.T @ (seen * both) + prior, both.T @ (seen * values))
-    return found.reshape(sides[0] ** 2, sides[1] ** 2, 3)
+    solution = np.linalg.solve(both.T @ (seen * both) + prior, both.T @ (seen * values))
+    return solution.reshape(sides[0] ** 2, sides[1] ** 2, 3)
 
 
 class TestSolve:
