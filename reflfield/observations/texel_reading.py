@@ -73,7 +73,7 @@ class Shade:
     Parameters
     ----------
     values : (n, n_lights, 3) float32
-        Mean over the views, in the domain.
+        Mean over the views of transformed samples.
     weights : (n, n_lights, 3) float32
         Views that measured it; 0 where the light reaches the texel.
     lights : (n, n_lights, 3) float32
@@ -196,7 +196,7 @@ class TexelReader:
 
     @property
     def sample_bytes_per_texel(self) -> int:
-        """Memory of one texel's samples in the domain, with taps."""
+        """Memory of one texel's transformed samples, with taps."""
         n_views, n_lights = self.capture.n_views, self.capture.n_lights
         return 2 * 12 * n_views * n_lights + 80 * (n_views + n_lights)
 

@@ -254,7 +254,7 @@ def factored_maxima(view, light, target):
 
 
 def exact_maxima(source, target, rotations):
-    """Index of the highest of some rotations by the exact series: no coarse step, no climb.
+    """Index of the highest of some rotations by the exact series: no coarse step, no ascent.
 
     Parameters
     ----------

@@ -149,7 +149,7 @@ def test_climbing_one_of_two_sides_loses_nothing(half_turns, rng, monkeypatch):
     short = search(source, target, half_turns=half_turns)
     monkeypatch.setattr(rotation_search, "SYMMETRIC_SHARE", 0.0)
     full = search(source, target, half_turns=half_turns)
-    # Of two sides within a thousandth, the full search keeps the one that it climbs first.
+    # Of two sides within a thousandth, the full search keeps the one that it ascends first.
     assert np.all(short.score >= full.score * (1 - 1e-6))
     same = short.score <= full.score * (1 + 1e-6)
     assert same.mean() > 0.9
