@@ -79,12 +79,12 @@ def package_of(path: Path) -> str:
     return Path(path.parts[1]).stem
 
 
-def breaches(package: str, found: list[Import]) -> list[Import]:
+def breaches(package: str, imports: list[Import]) -> list[Import]:
     """Imports of packages that come later than `package`."""
     allowed = PACKAGES[: PACKAGES.index(package) + 1]
     return [
         one
-        for one in found
+        for one in imports
         if one.module.startswith("reflfield.")
         and (name := one.module.split(".")[1]) in PACKAGES
         and name not in allowed
@@ -103,12 +103,12 @@ def test_a_module_name_occurs_once():
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_packages_import_only_earlier_packages(package):
-    found = {
+    crossing = {
         str(path): breaches(package, imports_in(path))
         for path in modules("reflfield")
         if package_of(path) == package
     }
-    assert {path: bad for path, bad in found.items() if bad} == {}
+    assert {path: bad for path, bad in crossing.items() if bad} == {}
 
 
 def test_the_package_itself_imports_no_package():
@@ -152,12 +152,12 @@ def test_the_check_sees_what_it_must():
         "def later():\n"
         "    import reflfield.cli\n"
     )
-    found = list(imports_of(ast.parse(source), "reflfield.field"))
-    assert [one.module for one in found] == [
+    imports = list(imports_of(ast.parse(source), "reflfield.field"))
+    assert [one.module for one in imports] == [
         "reflfield.field.evaluation",
         "reflfield.render",
         "reflfield.pipeline.stages.run",
         "reflfield.cli",
     ]
-    assert [one.inside_function for one in found] == [False, False, False, True]
-    assert [one.line for one in breaches("field", found)] == [2, 3, 5]
+    assert [one.inside_function for one in imports] == [False, False, False, True]
+    assert [one.line for one in breaches("field", imports)] == [2, 3, 5]

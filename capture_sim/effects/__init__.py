@@ -20,8 +20,9 @@ Stages, in the order in which they act, and what ``apply`` gets and returns ther
 ``VIEW``       rays of the pixels; once a view, the same for all lights
 ``LIGHT``      direct light that arrives at surface points
 ``TRANSPORT``  ``apply(scene, tracer, points, views, lights, traced)
-               -> (n, 3, n_lights)``: radiance that surface points send to the camera
-               beyond direct light
+               -> (n, 3, n_lights)``: radiance that n surface points send to the camera
+               beyond direct light; `views` are unit directions to it, (n, 3), in the
+               world, `traced` the visibility of the lights, where it is known
 ``OPTICS``     ``apply(radiance, scene, frame) -> radiance``: from the radiance of the
                scene to what arrives at the pixels, (h, w, 3) float32
 ``SENSOR``     ``apply(values, scene, frame) -> values``: from what arrives to what is

@@ -25,17 +25,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Tell whether pixels have several rays; there is no bound on what one ray meets.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
-    """
+    """Tell whether pixels have several rays; there is no bound on what one ray meets."""
     inside, edge = scene.image.samples_per_side, scene.image.edge_samples_per_side
     if max(inside, edge) == 1:
         return Decision("one ray per pixel was asked for", 0.0)

@@ -62,16 +62,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Tell whether the sensor has a mosaic; interpolation may miss an edge altogether.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Tell whether the sensor has a mosaic; interpolation may miss an edge altogether."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("pixels see all colours: no [effects.bayer]", 0.0)

@@ -37,16 +37,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the offset by five standard deviations, the cut by the noise in the dark.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the offset by five standard deviations, the cut by the noise in the dark."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("dark is zero: no [effects.black_level]", 0.0)
@@ -67,19 +58,6 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
     """Add the true pedestal, cut off what is below zero, subtract the nominal one.
-
-    Parameters
-    ----------
-    values : (h, w, 3) or (h, w) float32
-        Linear; of one mosaic if it has two axes.
-    scene : Scene
-        Gives level, drift and seed.
-    frame : Frame
-        Which photograph.
-
-    Returns
-    -------
-    (h, w, 3) or (h, w) float32
 
     References
     ----------

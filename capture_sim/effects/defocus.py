@@ -61,14 +61,6 @@ def needed(scene: Scene) -> Decision:
 
     Of the light of a pixel, a disc of diameter `c` pixels carries at most
     :math:`8 c / (6\pi)` elsewhere (its mean displacement in x and in y).
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
     """
     options = scene.effects.declared(Options)
     if options is None:
@@ -163,19 +155,6 @@ def disc_kernel(diameter: float) -> Float32:
 
 def apply(radiance: Float32, scene: Scene, frame: Frame) -> Float32:
     """Blur a photograph by the distance of what each pixel shows.
-
-    Parameters
-    ----------
-    radiance : (h, w, 3) float32
-        Linear, sharp.
-    scene : Scene
-        Gives lens and sensor.
-    frame : Frame
-        Gives the camera and the depth.
-
-    Returns
-    -------
-    (h, w, 3) float32
 
     Raises
     ------

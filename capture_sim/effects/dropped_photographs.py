@@ -30,16 +30,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Count the photographs that are missing: there is no bound on losing one.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Count the photographs that are missing: there is no bound on losing one."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("all photographs are there: no [effects.dropped_photographs]", 0.0)
@@ -61,16 +52,6 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 def apply(rig: Rig, scene: Scene) -> Rig:
     """Lose photographs.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives the fraction and the seed.
-
-    Returns
-    -------
-    Rig
 
     Raises
     ------

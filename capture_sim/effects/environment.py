@@ -56,16 +56,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by the radiance of a white surface that faces the brighter side.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by the radiance of a white surface that faces the brighter side."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("the dome is dark: no [effects.environment]", 0.0)

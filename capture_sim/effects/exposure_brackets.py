@@ -37,15 +37,6 @@ def needed(scene: Scene) -> Decision:
 
     What saturates in the shortest exposure is lost whatever its radiance was,
     so the bound is the brightest value.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
     """
     options = scene.effects.declared(Options)
     if options is None:

@@ -39,16 +39,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    r"""Bound the loss at the rim of the object, :math:`1 - \cos^p(\arcsin(r / d))`.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    r"""Bound the loss at the rim of the object, :math:`1 - \cos^p(\arcsin(r / d))`."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("lamps shine equally to all sides: no [effects.falloff_profile]", 0.0)
@@ -66,16 +57,6 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 def apply(rig: Rig, scene: Scene) -> Rig:
     """Turn point lights into spot lights that aim at the object's centre.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives exponent and centre.
-
-    Returns
-    -------
-    Rig
 
     References
     ----------

@@ -81,15 +81,6 @@ def needed(scene: Scene) -> Decision:
     with an albedo of at most :math:`\rho`, reflects at most :math:`\rho F` of the brightest
     radiance in sight, which itself holds at most that much again:
     :math:`\rho F / (1 - \rho F)` of the brightest direct radiance.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
     """
     if scene.mesh.convex:
         return Decision("a convex object throws no light on itself", 0.0)
@@ -122,26 +113,7 @@ def apply(
     lights: LightArrays,
     traced: TracedLights | None = None,
 ) -> Float32:
-    """Radiance that points send to the viewer after two or more reflections.
-
-    Parameters
-    ----------
-    scene : Scene
-        Gives the material, decides on shadows.
-    tracer : RayTracer
-        Of the scene's mesh.
-    points : SurfacePoints
-        n points.
-    views : (n, 3) float64
-        Unit directions to the viewer, world.
-    lights : LightArrays
-    traced : TracedLights, optional
-        Visibility of these lights, if known.
-
-    Returns
-    -------
-    (n, 3, n_lights) float32
-    """
+    """Radiance that points send to the viewer after two or more reflections."""
     radiance = np.zeros((len(points), 3, len(lights)), dtype=np.float32)
     for block in _blocks(scene, points, lights):
         by_path = _traced_paths(scene, tracer, points[block], views[block], lights, traced)

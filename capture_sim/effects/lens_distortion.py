@@ -53,16 +53,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by how far the outline of the object moves.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by how far the outline of the object moves."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("lenses as in [cameras]: no [effects.lens_distortion]", 0.0)
@@ -116,16 +107,6 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 def apply(rig: Rig, scene: Scene) -> Rig:
     """Bend the lenses of all cameras.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives the coefficients.
-
-    Returns
-    -------
-    Rig
 
     References
     ----------

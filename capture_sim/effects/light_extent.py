@@ -55,14 +55,6 @@ def needed(scene: Scene) -> Decision:
     none. A highlight loses at most the square of `a` times the steepness of the material,
     being symmetric about its peak. The penumbra is `2 a` times the way from what casts
     the shadow, at most the object's diameter.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
     """
     options = scene.effects.declared(Options)
     if options is None:

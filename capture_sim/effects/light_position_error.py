@@ -48,14 +48,6 @@ def needed(scene: Scene) -> Decision:
     radiance follows with the steepness of the material, irradiance with
     :math:`2 \delta / d`, and the edge of a shadow moves by the turn times the way from
     what casts it, at most the object's diameter.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
     """
     options = scene.effects.declared(Options)
     if options is None:
@@ -81,18 +73,7 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(rig: Rig, scene: Scene) -> Rig:
-    """Move the true lights; the reported ones stay.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives the standard deviations and the seed.
-
-    Returns
-    -------
-    Rig
-    """
+    """Move the true lights; the reported ones stay."""
     options = scene.effects.get(Options)
     errors = normal_errors(scene, NAME, len(scene.lights), 3)
     moved = zip(rig.lights, errors, strict=True)

@@ -35,16 +35,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by the factor that is farthest from 1; the factors are known.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by the factor that is farthest from 1; the factors are known."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("lights are as calibrated: no [effects.light_variation]", 0.0)
@@ -69,18 +60,7 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(rig: Rig, scene: Scene) -> Rig:
-    """Change the true lights; the reported ones stay.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives the standard deviations and the seed.
-
-    Returns
-    -------
-    Rig
-    """
+    """Change the true lights; the reported ones stay."""
     factors = _factors(scene, scene.effects.get(Options))
     changed = zip(rig.lights, factors, strict=True)
     return replace(rig, lights=tuple(_scaled(light, factor) for light, factor in changed))

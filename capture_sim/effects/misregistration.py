@@ -33,16 +33,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by the largest shift; the shifts drawn are known.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by the largest shift; the shifts drawn are known."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("views lie as calibrated: no [effects.misregistration]", 0.0)
@@ -61,18 +52,7 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(rig: Rig, scene: Scene) -> Rig:
-    """Shift the true cameras' images; the reported principal points stay.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives the standard deviation and the seed.
-
-    Returns
-    -------
-    Rig
-    """
+    """Shift the true cameras' images; the reported principal points stay."""
     shifts = _shifts(scene, scene.effects.get(Options)).tolist()
     return replace(
         rig,

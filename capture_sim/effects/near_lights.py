@@ -39,15 +39,6 @@ def needed(scene: Scene) -> Decision:
     For a light at distance `d` of the centre of an object of radius `r`, the
     irradiance varies by up to :math:`(1 - r/d)^{-2} - 1`; the direction turns by up
     to :math:`r/d`, and radiance follows with the steepness of the material.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
     """
     near = [light for light in scene.lights if light["type"] != "directional"]
     if not near:

@@ -41,16 +41,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by how far the images move: the errors drawn are known.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by how far the images move: the errors drawn are known."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("poses are exact: no [effects.pose_error]", 0.0)
@@ -75,18 +66,7 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(rig: Rig, scene: Scene) -> Rig:
-    """Move the true cameras; the reported ones stay.
-
-    Parameters
-    ----------
-    rig : Rig
-    scene : Scene
-        Gives the standard deviations and the seed.
-
-    Returns
-    -------
-    Rig
-    """
+    """Move the true cameras; the reported ones stay."""
     turns, moves = _errors(scene, scene.effects.get(Options))
     moved = zip(rig.cameras, turns, moves, strict=True)
     return replace(rig, cameras=tuple(_moved(*entry) for entry in moved))

@@ -52,16 +52,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by half a step, and by what full scale cuts off.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by half a step, and by what full scale cuts off."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("values are continuous: no [effects.quantisation]", 0.0)
@@ -80,21 +71,7 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
-    """Round to whole steps, at most the largest code.
-
-    Parameters
-    ----------
-    values : (...) float32
-        Linear.
-    scene : Scene
-        Gives the digitiser.
-    frame : Frame
-        Not used: all photographs are alike.
-
-    Returns
-    -------
-    (...) float32
-    """
+    """Round to whole steps, at most the largest code."""
     del frame
     options = scene.effects.get(Options)
     step = np.float32(options.step)

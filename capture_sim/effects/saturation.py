@@ -29,16 +29,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the loss by the brightest value that photographs may have.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the loss by the brightest value that photographs may have."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("pixels are never full: no [effects.saturation]", 0.0)
@@ -55,20 +46,6 @@ def cost(scene: Scene, work: Workload) -> Cost:
 
 
 def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
-    """Cut off what is too bright.
-
-    Parameters
-    ----------
-    values : (...) float32
-        Linear.
-    scene : Scene
-        Gives the largest value.
-    frame : Frame
-        Not used: all photographs are alike.
-
-    Returns
-    -------
-    (...) float32
-    """
+    """Cut off what is too bright."""
     del frame
     return np.minimum(values, np.float32(scene.effects.get(Options).radiance))

@@ -41,17 +41,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the noise of the brightest value, five standard deviations.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the noise of the brightest value, five standard deviations."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("a perfect sensor: no [effects.sensor_noise]", 0.0)
@@ -95,19 +85,6 @@ def standard_deviation(options: Options, radiance: float) -> float:
 
 def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
     """Photograph a noise-free image with a real sensor.
-
-    Parameters
-    ----------
-    values : (...) float32
-        Linear, not negative.
-    scene : Scene
-        Gives gain, read noise and seed.
-    frame : Frame
-        Which photograph and exposure.
-
-    Returns
-    -------
-    (...) float32
 
     References
     ----------

@@ -27,17 +27,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Tell whether the object can shadow itself; a shadow takes all light away.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
-    """
+    """Tell whether the object can shadow itself; a shadow takes all light away."""
     if scene.mesh.convex:
         return Decision("a convex object cannot shadow itself", 0.0)
     reason = "the object is not convex: parts of it hide lights from others"

@@ -80,17 +80,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change: all that the body reflects, or the part of a pixel that light crosses.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is to be simulated.
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change: all that the body reflects, or what crosses a part of a pixel."""
     material = scene.material
     if not isinstance(material, Translucent):
         return Decision("the material is not translucent", 0.0)
@@ -116,27 +106,7 @@ def apply(
     lights: LightArrays,
     traced: TracedLights | None = None,
 ) -> Float32:
-    """What scattering below the surface adds to that of a Lambertian body, or takes away.
-
-    Parameters
-    ----------
-    scene : Scene
-        Gives the material and decides on shadows.
-    tracer : RayTracer
-        Of the scene's mesh.
-    points : SurfacePoints
-        n points.
-    views : (n, 3) float64
-        Unit directions to the viewer, world.
-    lights : LightArrays
-    traced : TracedLights, optional
-        Visibility of these lights, if known.
-
-    Returns
-    -------
-    (n, 3, n_lights) float32
-        Radiance; all zero for materials that are not translucent.
-    """
+    """What scattering below the surface adds to that of a Lambertian body, or takes away."""
     change = np.zeros((len(points), 3, len(lights)), dtype=np.float32)
     material = scene.material
     if not isinstance(material, Translucent):

@@ -40,16 +40,7 @@ class Options:
 
 
 def needed(scene: Scene) -> Decision:
-    """Bound the change by the loss at the farthest pixel that shows the object.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Decision
-    """
+    """Bound the change by the loss at the farthest pixel that shows the object."""
     options = scene.effects.declared(Options)
     if options is None:
         return Decision("lenses are even: no [effects.vignetting]", 0.0)
@@ -115,19 +106,6 @@ def gain(camera: Table, options: Options) -> NDArray[np.float64]:
 
 def apply(radiance: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
     """Darken a photograph towards its corners.
-
-    Parameters
-    ----------
-    radiance : (h, w, 3) float32
-        Linear.
-    scene : Scene
-        Gives the shape.
-    frame : Frame
-        Gives the camera.
-
-    Returns
-    -------
-    (h, w, 3) float32
 
     References
     ----------

@@ -21,7 +21,7 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
 # A texel is nowhere brighter than its brightest sample, or than this many times the mean of
-# its cluster there, in the domain: of cube roots, 2.7 times in radiance.
+# its cluster there, transformed: of cube roots, 2.7 times in radiance.
 MOST_OF_MEAN = np.float32(1.4)
 # Samples of less weight, of light at less than about 5 degrees above the horizon, say little
 # of how bright a texel is: they are divided by the cosine of that light.

@@ -246,7 +246,7 @@ def clustered(field: ReflectanceField) -> ClusteredField:
 def light_response(
     field: ClusteredField, texels: ArrayLike, views_world: ArrayLike
 ) -> NDArray[np.float32]:
-    """Values at all light nodes, in the domain, for texels seen from given sides.
+    """Transformed values at all light nodes, for texels seen from given sides.
 
     Parameters
     ----------

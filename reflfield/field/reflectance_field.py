@@ -105,7 +105,7 @@ class ReflectanceField(ABC):
     @property
     @abstractmethod
     def usual_root(self) -> float:
-        """Root mean square of usual samples in the domain."""
+        """Root mean square of usual samples, transformed."""
 
     @property
     @abstractmethod
@@ -154,7 +154,7 @@ class ReflectanceField(ABC):
 
     @cached_property
     def indirect(self) -> IndirectLight:
-        """Indirect light, in the domain; see `field.indirect`."""
+        """Indirect light, transformed; see `field.indirect`."""
         functions, scale = (self.arrays[f"indirect_{n}"] for n in ("functions", "scale"))
         codes = self.arrays["indirect_coefficients"].astype(np.float32)
         self._check_samples("indirect_functions", functions, 0, codes * scale)
@@ -258,7 +258,7 @@ class ClusteredField(ReflectanceField):
 
     @property
     def usual_root(self) -> float:
-        """Root mean square of the means, in the domain."""
+        """Root mean square of the means, transformed."""
         return float(np.sqrt(np.mean(np.square(self.mean, dtype=np.float64))))
 
     @property

@@ -44,7 +44,7 @@ class TextureField(ReflectanceField):
 
     @property
     def usual_root(self) -> float:
-        """Root mean square of the colours in the domain."""
+        """Root mean square of the transformed colours."""
         roots = self.colours.astype(np.float64) ** (1.0 / self.inverse_power)
         return float(np.sqrt(np.mean(np.square(roots))))
 

@@ -6,14 +6,17 @@ The fallback where xatlas fails: always fast, always disjoint, but with many sea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from reflfield.errors import GeometryError
 from reflfield.geometry.mesh import Mesh
+from reflfield.util.late_import import LateImport
+
+sparse: Any = LateImport("scipy.sparse")
+csgraph: Any = LateImport("scipy.sparse.csgraph")
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -101,7 +104,7 @@ def _sides(mesh: Mesh) -> Integers:
     return side
 
 
-def _face_graph(mesh: Mesh) -> sparse.csr_array:
+def _face_graph(mesh: Mesh) -> Any:
     """Symmetric (m, m) matrix: 1 where two faces share an edge."""
     ends = np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     ends = np.sort(ends, axis=1)
@@ -120,7 +123,7 @@ def _connected(mesh: Mesh, label: Integers) -> Integers:
     kept = sparse.coo_array(
         (np.ones(int(same.sum())), (graph.row[same], graph.col[same])), shape=graph.shape
     )
-    return connected_components(kept, directed=False)[1].astype(np.int64)
+    return csgraph.connected_components(kept, directed=False)[1].astype(np.int64)
 
 
 def _projected(mesh: Mesh, side: Integers) -> tuple[Array, Array]:

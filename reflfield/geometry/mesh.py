@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry.open3d_library import open3d
@@ -18,6 +16,8 @@ from reflfield.util.files import replacing
 from reflfield.util.late_import import LateImport
 from reflfield.util.validation import check_shape
 
+sparse: Any = LateImport("scipy.sparse")
+csgraph: Any = LateImport("scipy.sparse.csgraph")
 trimesh: Any = LateImport("trimesh")
 
 Array = NDArray[np.float64]
@@ -245,7 +245,7 @@ def face_components(mesh: Mesh) -> NDArray[np.int32]:
     n = len(mesh.vertices)
     start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     graph = sparse.coo_array((np.ones(len(start), np.int8), (start, end)), shape=(n, n))
-    of_vertex = connected_components(graph.tocsr(), directed=False)[1]
+    of_vertex = csgraph.connected_components(graph.tocsr(), directed=False)[1]
     labels = np.unique(of_vertex[mesh.faces[:, 0]], return_inverse=True)[1]
     return labels.astype(np.int32)
 

@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.geometry.ray_scene import RayScene, row_strips
 from reflfield.geometry.texels import TexelTable
+from reflfield.util.late_import import LateImport
 from reflfield.util.validation import check_ranges, check_shape
+
+ndimage: Any = LateImport("scipy.ndimage")
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from reflfield.errors import GeometryError
 from reflfield.geometry.mesh import unit_or_zero
 from reflfield.geometry.uv_atlas import Atlas
+from reflfield.util.late_import import LateImport
+
+ndimage: Any = LateImport("scipy.ndimage")
 
 Array = NDArray[np.float64]
 

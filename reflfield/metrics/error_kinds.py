@@ -183,7 +183,7 @@ class KindFinder:
         (h, w) uint8
             Place in `KINDS`.
         """
-        counted, found = pair.counted, np.full(pair.counted.shape, NO_KIND, np.uint8)
+        counted, kind = pair.counted, np.full(pair.counted.shape, NO_KIND, np.uint8)
         near_outline = self._near_outline(pair, camera)
         columns = _columns(counted)
         for own, wide, inner in strips(*counted.shape):
@@ -193,8 +193,8 @@ class KindFinder:
             guides = self.guides(camera, light, wide, columns)
             bright = _is_highlight(pair, mean_texture, exposure, (own, columns))
             inner_guides = _guided_kinds(guides, bright, near_outline[own, columns], inner)
-            found[own, columns] = np.where(here[:, columns], inner_guides, NO_KIND)
-        return found
+            kind[own, columns] = np.where(here[:, columns], inner_guides, NO_KIND)
+        return kind
 
     def guides(
         self, camera: Camera, light: Light, rows: slice, columns: slice

@@ -81,7 +81,7 @@ class Shade:
     Parameters
     ----------
     values : (n, n_lights, 3) float32
-        Mean over the views, in the domain.
+        Mean over the views of transformed samples.
     weights : (n, n_lights, 3) float32
         Views that measured it; 0 where the light reaches the texel.
     lights : (n, n_lights, 3) float32

@@ -77,11 +77,11 @@ def write_comparison_with(
         pairs = RelitPairs(frames, partial / "relit", silhouettes).measured_in(comparison)
         analyser = _analyser(field, frames, photographs, options)
         analysed = analyse(analyser, pairs, comparison, Path(scratch))
-        found = metrics_of(analysed)
-        (partial / "metrics.json").write_text(metrics_text(comparison.to_dict(), **found))
+        analysis = metrics_of(analysed)
+        (partial / "metrics.json").write_text(metrics_text(comparison.to_dict(), **analysis))
         images = analysed_images(TITLE, comparison, analysed, pairs, Path(scratch))
         write_report(partial / "report" / "index.html", _page(field, pairs, images))
-    return {**comparison.to_dict(), **found}
+    return {**comparison.to_dict(), **analysis}
 
 
 def _analyser(

@@ -59,7 +59,7 @@ def write_compressed(texels: Resampled, maker: FieldMaker, folder: Path) -> dict
         "field bytes": size,
         "raw bytes": raw,
         "compression ratio": raw / size,
-        "residual in the domain": float(model.residuals[-1]),
+        "residual of the transformed samples": float(model.residuals[-1]),
         "relative error of the samples": error.linear,
         "relative error of their cube roots": error.cube_root,
         "LDR PSNR of the samples, dB": error.psnr_ldr,

@@ -69,12 +69,12 @@ def _metrics(context: Context, analysed: Mapping[str, dict[str, Any]]) -> str:
     """``metrics.json``: that of the first set compared, with its analysis."""
     if not analysed:
         return metrics_text(None, held_out=held_out_counts(context.split))
-    name, found = next(iter(analysed.items()))
+    name, errors = next(iter(analysed.items()))
     compared = comparison.comparison_of(context, name)
     return metrics_text(
         None if compared is None else compared.to_dict(),
         held_out=held_out_counts(context.split),
-        **metrics_of(found),
+        **metrics_of(errors),
     )
 
 

@@ -57,7 +57,7 @@ def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
         "samples at edges of shadows": int(n_samples - n_used),
         "texels that show shadow": len(in_shade),
         "components": len(model.variances),
-        "residual in the domain": float(np.sqrt(model.noise)),
+        "residual of the transformed samples": float(np.sqrt(model.noise)),
     }
 
 

@@ -82,16 +82,16 @@ def _results(context: Context) -> Iterator[tuple[str, Path, Mapping[str, Any]]]:
 
     Of stages with a result of the same name, that of the last which has run or follows.
     """
-    found: dict[str, tuple[Path, Mapping[str, Any]]] = {}
+    latest: dict[str, tuple[Path, Mapping[str, Any]]] = {}
     for stage, files in RESULTS.items():
         for source, target in files.items():
             if context.stages.record(stage) is None and not (
-                target in found and key_that_follows(context.stages, stage) is not None
+                target in latest and key_that_follows(context.stages, stage) is not None
             ):
                 continue
             folder = context.stages.root / stage
-            found[target] = folder / source, read_record(folder)["checksums"]["files"][source]
-    for target, (path, recorded) in found.items():
+            latest[target] = folder / source, read_record(folder)["checksums"]["files"][source]
+    for target, (path, recorded) in latest.items():
         yield target, path, recorded
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
 from reflfield.field.evaluation import texel_taps
@@ -19,6 +18,9 @@ from reflfield.geometry.occlusion import VisibilityOptions
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.geometry.uv_atlas import Atlas
+from reflfield.util.late_import import LateImport
+
+spatial: Any = LateImport("scipy.spatial")
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -331,5 +333,5 @@ def _nearest_rows(
         pixel = np.argwhere(field.texel_of_pixel >= 0)
         any_pixel = np.zeros((field.n_texels, 2), np.int64)
         any_pixel[field.texel_of_pixel[pixel[:, 0], pixel[:, 1]]] = pixel
-        row[absent] = cKDTree(covered_pixels).query(any_pixel[absent])[1]
+        row[absent] = spatial.cKDTree(covered_pixels).query(any_pixel[absent])[1]
     return row

@@ -45,12 +45,16 @@ References
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError
+from reflfield.util.late_import import LateImport
 from reflfield.util.validation import unit_direction
+
+transform: Any = LateImport("scipy.spatial.transform")
 
 Array = NDArray[np.float64]
 
@@ -125,15 +129,15 @@ def world_from_map(convention: str, up: ArrayLike, rotation_deg: float = 0.0) ->
         raise InputError(
             f"rotation of the map: expected a finite number of degrees, received {rotation_deg}"
         )
-    about_up = Rotation.from_rotvec(np.radians(float(rotation_deg) % 360.0) * axis)
+    about_up = transform.Rotation.from_rotvec(np.radians(float(rotation_deg) % 360.0) * axis)
     upright = _shortest_rotation(np.array(MAP_UP[convention]), axis)
     return np.asarray((about_up * upright).as_matrix())
 
 
-def _shortest_rotation(first: Array, second: Array) -> Rotation:
+def _shortest_rotation(first: Array, second: Array) -> Any:
     """Rotation of least angle that takes one unit vector to another."""
     axis, cosine = np.cross(first, second), float(first @ second)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-12:  # parallel; opposite vectors leave the axis open
-        return Rotation.from_rotvec([0.0 if cosine > 0 else np.pi, 0.0, 0.0])
-    return Rotation.from_rotvec(np.arctan2(sine, cosine) / sine * axis)
+        return transform.Rotation.from_rotvec([0.0 if cosine > 0 else np.pi, 0.0, 0.0])
+    return transform.Rotation.from_rotvec(np.arctan2(sine, cosine) / sine * axis)

@@ -193,7 +193,7 @@ class Tally:
     repeated : int
         Times that one of those computed was begun again, lost with a worker of a cluster.
     cpu_seconds : dict of str to float
-        Of the processor, this process only, by the name of the work.
+        CPU time of this process only, by the name of the work.
     """
 
     computed: int = 0

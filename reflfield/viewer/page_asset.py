@@ -115,8 +115,8 @@ def packed_block(arrays: Mapping[str, NDArray[Any]]) -> PackedBlock:
     ([0], 4000, True)
     """
     entries, parts, start = [], [], 0
-    for name, given in arrays.items():
-        array = np.ascontiguousarray(given).astype(given.dtype.newbyteorder("<"))
+    for name, values in arrays.items():
+        array = np.ascontiguousarray(values).astype(values.dtype.newbyteorder("<"))
         content, way = min(_packings(array), key=lambda one: len(zlib.compress(one[0], 1)))
         entry = {"name": name, "dtype": array.dtype.name, "shape": list(array.shape)}
         entries.append({**entry, **way, "start": start})

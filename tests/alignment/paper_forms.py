@@ -64,12 +64,12 @@ def turned(columns, rotations, dtype="float64"):
     band_limit = round(len(columns) ** 0.5)
     blocks = rotation_blocks(rotations, band_limit, dtype)
     offsets = block_offsets(band_limit)
-    found = []
+    parts = []
     for ell in range(band_limit):
         size = 2 * ell + 1
         block = blocks[:, offsets[ell] : offsets[ell + 1]].reshape(-1, size, size)
-        found.append(np.matmul(block, columns[degree(ell)].astype(dtype)))
-    return np.concatenate(found, axis=1)
+        parts.append(np.matmul(block, columns[degree(ell)].astype(dtype)))
+    return np.concatenate(parts, axis=1)
 
 
 def direct_correlations(a, b, rotations):
@@ -254,7 +254,7 @@ def factored_maxima(view, light, target):
 
 
 def exact_maxima(source, target, rotations):
-    """Index of the highest of some rotations by the exact series: no coarse step, no climb.
+    """Index of the highest of some rotations by the exact series: no coarse step, no ascent.
 
     Parameters
     ----------

@@ -46,11 +46,11 @@ def mixture(scene, rng, materials, n):
     return frames, directions, samples, label
 
 
-def agreement(found, label):
+def agreement(labels, label):
     """Share of equal labels under the best matching of clusters and materials."""
-    size = max(found.max(), label.max()) + 1
+    size = max(labels.max(), label.max()) + 1
     table = np.zeros((size, size), int)
-    np.add.at(table, (found, label), 1)
+    np.add.at(table, (labels, label), 1)
     return table[linear_sum_assignment(-table)].sum() / len(label)
 
 
@@ -64,9 +64,9 @@ SHINY_AND_DULL = (SIMILAR[0], {"nu": 20.0, "nv": 20.0, "diffuse": 0.4, "specular
 )
 def test_materials_are_told_apart_and_normals_as_good_as_alone(materials, scene, rng):
     frames, d, samples, label = mixture(scene, rng, materials, 40 * len(materials))
-    found = align(samples, d, d, n_clusters=len(materials), refine=QUICK, n_threads=2)
-    assert agreement(found.cluster, label) >= 0.99
-    errors = scene.frame_errors(found.local_from_base, frames)[0]
+    alignment = align(samples, d, d, n_clusters=len(materials), refine=QUICK, n_threads=2)
+    assert agreement(alignment.cluster, label) >= 0.99
+    errors = scene.frame_errors(alignment.local_from_base, frames)[0]
     for k in range(len(materials)):
         mine = label == k
         alone = align(samples[mine], d, d, refine=QUICK, n_threads=2)
@@ -89,13 +89,13 @@ def mixed_relief(scene, materials, n):
 @pytest.mark.slow
 def test_a_material_whose_in_plane_angles_the_samples_tell_leaves_the_other_as_it_is(scene):
     frames, d, samples, label = mixed_relief(scene, (SIMILAR[0], FAR_APART[1]), 240)
-    found = align(samples, d, d, n_clusters=2, n_threads=2)
-    assert agreement(found.cluster, label) == 1.0
+    alignment = align(samples, d, d, n_clusters=2, n_threads=2)
+    assert agreement(alignment.cluster, label) == 1.0
     first = label == 0
     alone = align(samples[first], d, d, n_threads=2)
     apart = scene.frame_errors(alone.local_from_base, frames[first])[0]
     # Its target once took the steps of the other's too, and followed its noise.
-    errors = scene.frame_errors(found.local_from_base[first], frames[first])[0]
+    errors = scene.frame_errors(alignment.local_from_base[first], frames[first])[0]
     assert errors.mean() < 1.05 * apart.mean()
 
 
@@ -104,24 +104,24 @@ def test_few_texels_of_a_shiny_and_a_dull_material_are_told_apart(scene):
     # Of these, targets fitted to a third of the views took 64 % to the right material: with so
     # few texels, those views say nothing of the others.
     frames, d, samples, label = mixed_relief(scene, SHINY_AND_DULL, 100)
-    found = align(samples, d, d, n_clusters=2, n_threads=2)
-    assert agreement(found.cluster, label) == 1.0
-    assert scene.frame_errors(found.local_from_base, frames)[0].mean() < 0.2
+    alignment = align(samples, d, d, n_clusters=2, n_threads=2)
+    assert agreement(alignment.cluster, label) == 1.0
+    assert scene.frame_errors(alignment.local_from_base, frames)[0].mean() < 0.2
 
 
 @pytest.mark.slow
 def test_noise_of_two_per_cent_leaves_similar_materials_apart(scene, rng):
     _, d, samples, label = mixture(scene, rng, SIMILAR, 120)
     samples += 0.02 * samples.std() * rng.standard_normal(samples.shape, np.float32)
-    found = align(samples, d, d, n_clusters=2, refine=QUICK, n_threads=2)
-    assert agreement(found.cluster, label) >= 0.97
+    alignment = align(samples, d, d, n_clusters=2, refine=QUICK, n_threads=2)
+    assert agreement(alignment.cluster, label) >= 0.97
 
 
 def test_history_never_falls_with_several_clusters(scene, rng):
     _, d, samples, _ = mixture(scene, rng, FAR_APART, 120)
-    found = align(samples, d, d, n_clusters=4, iterations=8, refine=False)
-    assert len(found.history) > 1
-    assert np.all(np.diff(found.history) >= -1e-6)  # float32 sums
+    alignment = align(samples, d, d, n_clusters=4, iterations=8, refine=False)
+    assert len(alignment.history) > 1
+    assert np.all(np.diff(alignment.history) >= -1e-6)  # float32 sums
 
 
 @pytest.mark.slow
@@ -189,19 +189,19 @@ def test_features_are_a_part_of_the_distance(crude):
 @pytest.mark.parametrize("refine", [False, QUICK], ids=["harmonic", "refined"])
 def test_more_clusters_than_texels_and_than_materials(refine, scene, rng):
     _, d, samples, _ = mixture(scene, rng, SIMILAR, 3)
-    found = align(samples, d, d, n_clusters=8, refine=refine)
-    assert 0 <= found.cluster.min() <= found.cluster.max() < 8
-    assert np.isfinite(found.local_from_base).all()
-    assert found.score.min() > 0.5
+    alignment = align(samples, d, d, n_clusters=8, refine=refine)
+    assert 0 <= alignment.cluster.min() <= alignment.cluster.max() < 8
+    assert np.isfinite(alignment.local_from_base).all()
+    assert alignment.score.min() > 0.5
 
 
 @pytest.mark.stability
 @pytest.mark.parametrize("refine", [False, QUICK], ids=["harmonic", "refined"])
 def test_duplicates_of_one_texel_stay_together(refine, scene, rng):
     _, d, samples, _ = mixture(scene, rng, SIMILAR[:1], 1)
-    found = align(np.tile(samples, (12, 1, 1)), d, d, n_clusters=4, refine=refine)
-    assert len(np.unique(found.cluster)) == 1
-    spread = np.ptp(found.local_from_base, axis=0).max()
+    alignment = align(np.tile(samples, (12, 1, 1)), d, d, n_clusters=4, refine=refine)
+    assert len(np.unique(alignment.cluster)) == 1
+    spread = np.ptp(alignment.local_from_base, axis=0).max()
     assert spread < 1e-6  # one texel, one answer; sums of float32 may be ordered differently
 
 
@@ -224,11 +224,11 @@ def test_a_cluster_of_one_texel_is_found_and_does_not_disturb(scene, rng):
     odd = scene.sample_texels(frames[:1], d, d, **FAR_APART[2])
     samples[17] = odd[0]
     samples[3] = np.nan
-    found = align(samples, d, d, n_clusters=2, refine=QUICK)
-    others = np.delete(found.cluster, [3, 17])
+    alignment = align(samples, d, d, n_clusters=2, refine=QUICK)
+    others = np.delete(alignment.cluster, [3, 17])
     assert np.all(others == others[0])
-    assert found.cluster[17] != others[0]
-    assert found.score[3] == 0.0
+    assert alignment.cluster[17] != others[0]
+    assert alignment.score[3] == 0.0
 
 
 def test_no_division_where_nothing_is_gained(scene, rng):

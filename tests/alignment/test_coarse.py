@@ -51,9 +51,9 @@ def test_maxima_at_the_tilt_limit_have_a_start_inside_it(rng):
     series = falling_series(rng, 30, 6, np.float32)
     for limit in (0.02, 0.3, 1.0):
         rotations, heights = coarse_peaks(series, 6, 4, limit)
-        found = np.isfinite(rotations[..., 2, 2])
-        assert found[:, 0].all()
-        assert (rotations[found][:, 2, 2] >= np.cos(limit) - 1e-12).all()
+        filled = np.isfinite(rotations[..., 2, 2])
+        assert filled[:, 0].all()
+        assert (rotations[filled][:, 2, 2] >= np.cos(limit) - 1e-12).all()
         assert np.isfinite(heights).all()
 
 

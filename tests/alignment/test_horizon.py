@@ -33,10 +33,10 @@ def test_unseen_part_of_the_target_itself_is_found_exactly(horizon, dtype, rng, 
     target = couple(rng.standard_normal((1, 36, 36)).astype(dtype))
     turns = Rotation.random(7, random_state=0).as_matrix()
     whole = turned(target, turns).scaled(np.linspace(0.2, 3.0, 7))
-    found = horizon.imputed(horizon.seen(whole), target, turns)
+    whole_again = horizon.imputed(horizon.seen(whole), target, turns)
     # Two products with operators of 36 rows, stored in float32, and two recombinations.
     tolerance = rounding(np.float32, operations=4 * 36, scale=float(whole.norms().max()))
-    for a, b in zip(found.blocks, whole.blocks, strict=True):
+    for a, b in zip(whole_again.blocks, whole.blocks, strict=True):
         np.testing.assert_allclose(a, b, atol=tolerance)
 
 
@@ -55,14 +55,14 @@ def test_imputation_finds_rotations_of_functions_cut_at_the_horizon(horizon, rng
     target = couple(rng.standard_normal((1, 36, 36)) * falling[:, None] * falling).units()
     turns = Rotation.from_rotvec(rng.normal(0, 0.4, (40, 3))).as_matrix()
     cut = horizon.seen(turned(target, turns))
-    found = search(cut, target)
-    imputed = impute_and_ascend(cut, target, found, horizon, 30, OPTIONS)
+    maxima = search(cut, target)
+    imputed = impute_and_ascend(cut, target, maxima, horizon, 30, OPTIONS)
 
     def error(rotations):
         chord = np.linalg.norm(rotations - turns, axis=(1, 2)) / np.sqrt(2.0)
         return np.rad2deg(np.median(chord))
 
-    assert error(found.rotations) > 2.0
+    assert error(maxima.rotations) > 2.0
     assert error(imputed.rotations) < 0.5  # where the steps of a round fall below .05 degrees
 
 
@@ -82,10 +82,10 @@ def test_tilted_texels_are_no_longer_drawn_to_the_base_frame(scene):
     samples = scene.sample_texels(frames, directions, directions)
     result = align(samples, directions, directions, refine=False)
     steep = frames[:, 2, 2] < np.cos(np.deg2rad(10.0))
-    found = result.local_from_base[steep][:, 2]
+    normals = result.local_from_base[steep][:, 2]
     outwards = frames[steep][:, 2] * [1, 1, 0]
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-    towards = np.rad2deg(np.sum((found - frames[steep][:, 2]) * outwards, axis=1))
+    towards = np.rad2deg(np.sum((normals - frames[steep][:, 2]) * outwards, axis=1))
     # 2.8 degrees towards the base normal if what is unseen counts as dark.
     assert abs(towards.mean()) < 0.5
 

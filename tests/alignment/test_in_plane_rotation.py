@@ -38,10 +38,12 @@ def leaning(local, lean):
     return np.where(seen, (1.0 + lean * both) * up[:, None, :], 0.0).astype(np.float32)
 
 
-def errors_less_common_rotation(found, truth):
+def errors_less_common_rotation(recovered, truth):
     """Normal and turn errors in degrees after the common turn that fits best."""
-    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", truth, found))
-    between = (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt) @ found @ truth.swapaxes(1, 2)
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", truth, recovered))
+    between = (
+        (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt) @ recovered @ truth.swapaxes(1, 2)
+    )
     normal = np.arctan2(np.hypot(between[:, 0, 2], between[:, 1, 2]), between[:, 2, 2])
     turn = np.arctan2(between[:, 0, 1] - between[:, 1, 0], between[:, 0, 0] + between[:, 1, 1])
     return np.rad2deg(normal), np.rad2deg(np.abs(turn))
@@ -52,22 +54,22 @@ def test_angles_of_a_leaning_pile_are_found(scene, rng):
     d = scene.dome_directions()
     truth = frames_of_any_angle(rng, 100, 45.0)
     samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.3)
-    found = align(samples, d, d, refine=QUICK, n_threads=2)
-    assert found.symmetries == ("none",)
-    normal, turn = errors_less_common_rotation(found.local_from_base, truth)
+    alignment = align(samples, d, d, refine=QUICK, n_threads=2)
+    assert alignment.symmetries == ("none",)
+    normal, turn = errors_less_common_rotation(alignment.local_from_base, truth)
     # The harmonic search leaves several degrees; turns at random would be off by 90.
     assert np.median(normal) < 1.5
     assert np.median(turn) < 5.0
-    assert found.margin.max() > 0.0
+    assert alignment.margin.max() > 0.0
 
 
 def test_isotropic_reflectance_keeps_the_angle_of_the_base_frame(scene, rng):
     d = scene.dome_directions()
     truth = frames_of_any_angle(rng, 60, 45.0)
     samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.0)
-    found = align(samples, d, d, refine=QUICK, n_threads=2)
-    assert found.symmetries == ("all",)
-    frames = found.local_from_base
+    alignment = align(samples, d, d, refine=QUICK, n_threads=2)
+    assert alignment.symmetries == ("all",)
+    frames = alignment.local_from_base
     # The turn nearest to the base frame leaves no antisymmetric part in the tangent plane.
     assert np.abs(frames[:, 0, 1] - frames[:, 1, 0]).max() < 1e-6
 

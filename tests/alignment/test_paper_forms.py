@@ -71,8 +71,8 @@ def test_exact_series_has_its_maximum_where_the_direct_sum_has(
 ):
     monkeypatch.setattr(paper_forms, "SERIES_AT_ONCE", 100)
     source = couple(abrdfs.astype(np.float32))
-    found = paper_forms.exact_maxima(source, source[1:], grid)
-    for one, index in zip(abrdfs, found, strict=True):
+    maxima = paper_forms.exact_maxima(source, source[1:], grid)
+    for one, index in zip(abrdfs, maxima, strict=True):
         values = paper_forms.direct_abrdf_correlations(one, abrdfs[1], grid)
         # Of a function with itself R and its transpose give the same: rounding decides.
         bound = rounding(np.float32, L**4, scale=np.linalg.norm(one) ** 2)

@@ -63,8 +63,8 @@ def plain(sparse):
 def refined(gridded, raw, **keywords):
     source = None if raw is None else Source(raw)
     options = {"band_limit": 6, "refine": OPTIONS} | keywords
-    found = align(gridded.samples, gridded.views, gridded.lights, raw=source, **options)
-    return found.local_from_base
+    alignment = align(gridded.samples, gridded.views, gridded.lights, raw=source, **options)
+    return alignment.local_from_base
 
 
 def normal_error(frames, truth):

@@ -19,8 +19,8 @@ def lobes(rng, n, band_limit, dtype=np.float64):
     return (rng.standard_normal(shape) * falling[:, None] * falling).astype(dtype)
 
 
-def error_of(found, truth):
-    return np.rad2deg(rotation_angle(np.swapaxes(truth, 1, 2) @ found))
+def error_of(rotations, truth):
+    return np.rad2deg(rotation_angle(np.swapaxes(truth, 1, 2) @ rotations))
 
 
 def turned_copies(target, truth):
@@ -67,14 +67,20 @@ def test_derivatives_match_differences(band_limit, rng):
         np.diag([1.0, -1, -1]),
         Rotation.random(random_state=4).as_matrix(),
     ):
-        found = follow(series, row, turn[None], 0)[1][0]
+        derivatives = follow(series, row, turn[None], 0)[1][0]
         step = [rotation_about(axis[None], h)[0] for axis in np.eye(3)]
         gradient = [(value(turn @ e) - value(turn @ e.T)) / (2 * h) for e in step]
-        scale = np.abs(found[1:4]).max()
+        scale = np.abs(derivatives[1:4]).max()
         # Differences of a function of degree 2 L - 2: relative error (h degree)^2 / 6.
-        np.testing.assert_allclose(found[1:4], gradient, atol=scale * (h * 2 * band_limit) ** 2)
-        second = [(value(turn @ e) + value(turn @ e.T) - 2 * found[0]) / h**2 for e in step]
-        np.testing.assert_allclose(found[4:7], second, atol=1e-4 * np.abs(found[4:7]).max())
+        np.testing.assert_allclose(
+            derivatives[1:4], gradient, atol=scale * (h * 2 * band_limit) ** 2
+        )
+        second = [
+            (value(turn @ e) + value(turn @ e.T) - 2 * derivatives[0]) / h**2 for e in step
+        ]
+        np.testing.assert_allclose(
+            derivatives[4:7], second, atol=1e-4 * np.abs(derivatives[4:7]).max()
+        )
 
 
 @pytest.mark.parametrize("limits", [(8, 8), (4, 4), (6, 3), (1, 8), (8, 1)])
@@ -82,10 +88,10 @@ def test_planted_rotations_come_back(limits, rng):
     a = rng.standard_normal((1, limits[0] ** 2, limits[1] ** 2)).astype(np.float32)
     target = couple(a)
     truth = Rotation.random(100, random_state=2).as_matrix()
-    found = search(turned_copies(target, truth), target)
-    assert error_of(found.rotations, truth).max() < 0.05  # what the issue demands of a peak
-    np.testing.assert_allclose(found.score, 1.0, atol=1e-5)  # float32 sums
-    assert found.margin.min() > 0.01
+    maxima = search(turned_copies(target, truth), target)
+    assert error_of(maxima.rotations, truth).max() < 0.05  # what the issue demands of a peak
+    np.testing.assert_allclose(maxima.score, 1.0, atol=1e-5)  # float32 sums
+    assert maxima.margin.min() > 0.01
 
 
 @pytest.mark.stability
@@ -93,8 +99,8 @@ def test_planted_rotations_come_back(limits, rng):
 def test_poles_of_the_euler_angles_are_not_special(beta, rng):
     target = couple(lobes(rng, 1, 6, np.float32))
     truth = Rotation.from_euler("ZYZ", [[0.3, beta, -1.2], [0.0, beta, 0.0]]).as_matrix()
-    found = search(turned_copies(target, truth), target)
-    assert error_of(found.rotations, truth).max() < 0.05
+    maxima = search(turned_copies(target, truth), target)
+    assert error_of(maxima.rotations, truth).max() < 0.05
 
 
 @pytest.mark.stability
@@ -104,8 +110,8 @@ def test_found_maximum_is_the_global_one(rng):
     grid = Rotation.random(20000, random_state=1).as_matrix()
     values = spectrum(source, target) @ rotation_blocks(grid, 11, "float32").T
     brute = values.max(axis=1) / (source.norms() * target.norms())
-    found = search(source, target, n_peaks=8)
-    assert np.sum(found.score < brute - 1e-5) <= 1  # rounding; one miss in 12 is tolerated
+    maxima = search(source, target, n_peaks=8)
+    assert np.sum(maxima.score < brute - 1e-5) <= 1  # rounding; one miss in 12 is tolerated
 
 
 def nearly_symmetric(target, odd):
@@ -123,12 +129,12 @@ def test_of_two_sides_that_hardly_differ_the_better_is_found(odd, rng):
     assert odd_share(target) < rotation_search.SYMMETRIC_SHARE
     truth = Rotation.random(100, random_state=5).as_matrix()
     result = search(turned_copies(target, truth), target)
-    found = result.rotations
+    rotations = result.rotations
     if odd == 0.0:
-        other = found @ np.diag([-1.0, -1.0, 1.0])
-        assert np.minimum(error_of(found, truth), error_of(other, truth)).max() < 0.05
+        other = rotations @ np.diag([-1.0, -1.0, 1.0])
+        assert np.minimum(error_of(rotations, truth), error_of(other, truth)).max() < 0.05
     else:
-        assert error_of(found, truth).max() < 0.05
+        assert error_of(rotations, truth).max() < 0.05
     # The odd part counts against the other side twice, whose peak lies a little aside.
     np.testing.assert_allclose(result.margin, 2 * odd_share(target), rtol=0.03, atol=1e-6)
 
@@ -143,7 +149,7 @@ def test_climbing_one_of_two_sides_loses_nothing(half_turns, rng, monkeypatch):
     short = search(source, target, half_turns=half_turns)
     monkeypatch.setattr(rotation_search, "SYMMETRIC_SHARE", 0.0)
     full = search(source, target, half_turns=half_turns)
-    # Of two sides within a thousandth, the full search keeps the one that it climbs first.
+    # Of two sides within a thousandth, the full search keeps the one that it ascends first.
     assert np.all(short.score >= full.score * (1 - 1e-6))
     same = short.score <= full.score * (1 + 1e-6)
     assert same.mean() > 0.9
@@ -167,14 +173,14 @@ def test_on_a_ridge_no_other_turn_is_better(rng):
     truth = Rotation.random(200, random_state=8).as_matrix()
     source = uncouple(turned_copies(target, truth))
     source = couple(source + 0.05 * lobes(rng, len(truth), 6))
-    found = search(source, target, margins=False)
+    maxima = search(source, target, margins=False)
     angles = np.tile(np.arange(24) * np.pi / 12, len(truth))
     about = rotation_about(np.tile([0.0, 0.0, 1.0], (len(angles), 1)), angles)
-    others = np.repeat(found.rotations, 24, axis=0) @ about
+    others = np.repeat(maxima.rotations, 24, axis=0) @ about
     rows = np.repeat(np.arange(len(truth)), 24)
     heights = follow(spectrum(source, target.units()), rows, others, 12)[1][:, 0]
     highest = heights.reshape(-1, 24).max(axis=1) / source.norms()
-    assert np.all(highest <= found.score + 1e-5)
+    assert np.all(highest <= maxima.score + 1e-5)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-6, 1e6, 1e12])
@@ -208,19 +214,19 @@ def test_tilt_limit_is_kept(rng):
     truth = Rotation.from_euler(
         "ZYZ", [[0.2, b, 0.4] for b in (0.1, 0.8, 1.5, 2.5)]
     ).as_matrix()
-    found = search(turned_copies(target, truth), target, max_tilt=1.0)
-    tilt = np.arccos(np.clip(found.rotations[:, 2, 2], -1, 1))
+    maxima = search(turned_copies(target, truth), target, max_tilt=1.0)
+    tilt = np.arccos(np.clip(maxima.rotations[:, 2, 2], -1, 1))
     assert tilt.max() <= 1.0 + 1e-6
-    assert error_of(found.rotations, truth)[:2].max() < 0.05
+    assert error_of(maxima.rotations, truth)[:2].max() < 0.05
 
 
 def test_best_of_several_targets_is_found(rng):
     targets = couple(lobes(rng, 5, 5, np.float32))
     truth = Rotation.random(40, random_state=5).as_matrix()
     label = np.arange(40) % 5
-    found = search(turned_copies(targets[label], truth), targets)
-    assert np.array_equal(found.cluster, label)
-    assert error_of(found.rotations, truth).max() < 0.05
+    maxima = search(turned_copies(targets[label], truth), targets)
+    assert np.array_equal(maxima.cluster, label)
+    assert error_of(maxima.rotations, truth).max() < 0.05
 
 
 def test_round_lobe_has_no_margin_and_a_zero_function_no_score(rng):
@@ -228,8 +234,8 @@ def test_round_lobe_has_no_margin_and_a_zero_function_no_score(rng):
     zonal = np.arange(5) ** 2 + np.arange(5)
     axial[0, zonal[:, None], zonal[None, :]] = rng.standard_normal((5, 5))
     target = couple(axial)
-    found = search(target, target)
-    assert found.margin[0] < 1e-3
+    maxima = search(target, target)
+    assert maxima.margin[0] < 1e-3
     nothing = search(target.scaled(np.zeros(1)), target)
     assert nothing.score[0] == 0.0
     assert nothing.margin[0] == 0.0

@@ -46,16 +46,16 @@ class Job:
         """Coefficients (n, L^2) of functions of one direction, and of the target's."""
         return self.data["functions"][:n].astype(dtype), self.data["function"].astype(dtype)
 
-    def report(self, table, method, found, n, **rest):
+    def report(self, table, method, measurement, n, **rest):
         """Print one row."""
         row = {
             "table": table,
             "method": method,
             "band_limit": self.band_limit,
             "cores": self.n_cores,
-            "ms": found.seconds / n * 1e3,
-            "cpu_ms": found.cpu_seconds / n * 1e3,
-            "megabytes": found.megabytes,
+            "ms": measurement.seconds / n * 1e3,
+            "cpu_ms": measurement.cpu_seconds / n * 1e3,
+            "megabytes": measurement.megabytes,
         }
         print(json.dumps(row | rest), flush=True)
 
@@ -69,13 +69,13 @@ class Job:
             for name in ("maxima", "planted")
         }
 
-    def report_rotations(self, method, found, rotations, **rest):
+    def report_rotations(self, method, measurement, rotations, **rest):
         """Print one row of Table 2."""
         error = self.angles(rotations)
         self.report(
             2,
             method,
-            found,
+            measurement,
             len(rotations),
             median=float(np.median(error["maxima"])),
             tail=float(np.percentile(error["maxima"], 99)),
@@ -84,7 +84,7 @@ class Job:
             **rest,
         )
 
-    def report_values(self, method, found, values, rotations):
+    def report_values(self, method, measurement, values, rotations):
         """Print one row of Table 1: (n, rotations) values against the direct sum."""
         a, b = self.functions(1)
         exact = paper_forms.direct_correlations(a[0], b, rotations)
@@ -92,7 +92,7 @@ class Job:
         self.report(
             1,
             method,
-            found,
+            measurement,
             len(values),
             rotations=len(rotations),
             error=float(np.abs(values[0] - exact).max() / scale),
@@ -118,11 +118,13 @@ def searching(job):
     """Every ABRDF searched globally, each refined to the peak; coupling excluded."""
     coefficients, target = job.abrdfs(None)
     source, aim = couple(coefficients), couple(target[None])
-    found = measured(
+    measurement = measured(
         lambda: search(source[:4], aim),
         lambda _: search(source, aim, margins=False, n_threads=job.n_cores),
     )
-    job.report_rotations("exact, searched, to the peak", found, found.answer.rotations)
+    job.report_rotations(
+        "exact, searched, to the peak", measurement, measurement.answer.rotations
+    )
 
 
 def spherical(job):
@@ -130,16 +132,16 @@ def spherical(job):
     a, b = job.functions(job.many, np.float32)
     pairs = np.broadcast_to(b, a.shape)
     grid = paper_forms.paper_grid(job.band_limit)
-    found = measured(
+    measurement = measured(
         lambda: paper_forms.separation_kernel(job.band_limit),
         lambda kernel: paper_forms.separated_correlations(a, pairs, kernel, job.n_cores),
     )
-    job.report_values("ours, any pairs (separated)", found, found.answer, grid)
-    found = measured(
+    job.report_values("ours, any pairs (separated)", measurement, measurement.answer, grid)
+    measurement = measured(
         lambda: paper_forms.turned(b[:, None], grid, "float32")[:, :, 0],
         lambda table: a @ table.T,
     )
-    job.report_values("ours, one target (product)", found, found.answer, grid)
+    job.report_values("ours, one target (product)", measurement, measurement.answer, grid)
 
 
 def on_grid(job):
@@ -147,10 +149,10 @@ def on_grid(job):
     coefficients, target = job.abrdfs(job.many)
     source, aim = couple(coefficients), couple(target[None])
     grid = paper_forms.paper_grid(job.band_limit)
-    found = measured(
+    measurement = measured(
         lambda: None, lambda _: grid[paper_forms.exact_maxima(source, aim, grid)], 2
     )
-    job.report_rotations("exact, on the paper's grid", found, found.answer)
+    job.report_rotations("exact, on the paper's grid", measurement, measurement.answer)
 
 
 def factored(job, rank):
@@ -158,22 +160,22 @@ def factored(job, rank):
     coefficients, target = job.abrdfs(job.many)
     grid = paper_forms.paper_grid(job.band_limit)
     own = [side.astype(np.float32) for side in paper_forms.factors(coefficients, rank)]
-    found = measured(
+    measurement = measured(
         lambda: paper_forms.turn_target(target, rank, grid),
         lambda table: grid[paper_forms.factored_maxima(*own, table)],
     )
-    job.report_rotations(f"Eq. 11, K={rank}, ours", found, found.answer, rank=rank)
+    job.report_rotations(f"Eq. 11, K={rank}, ours", measurement, measurement.answer, rank=rank)
 
 
 def preparing(job):
     """Projection of 151 x 151 samples, and coupling."""
     directions, samples = job.data["directions"], job.data["samples"]
     projector = Projector(directions, directions, (job.band_limit, job.band_limit))
-    found = measured(lambda: None, lambda _: projector.project(samples))
-    job.report(0, "projection, 151 x 151 samples", found, len(samples))
-    coefficients = found.answer
-    found = measured(lambda: None, lambda _: couple(coefficients))
-    job.report(0, "coupling", found, len(samples))
+    measurement = measured(lambda: None, lambda _: projector.project(samples))
+    job.report(0, "projection, 151 x 151 samples", measurement, len(samples))
+    coefficients = measurement.answer
+    measurement = measured(lambda: None, lambda _: couple(coefficients))
+    job.report(0, "coupling", measurement, len(samples))
 
 
 # --- the paper's direct sums ---------------------------------------------------------------
@@ -183,10 +185,10 @@ def brute(job):
     """Eq. 5, 8, 10 and 3, one pair."""
     grid, data = paper_forms.paper_grid(job.band_limit), job.data
     a, b = job.functions(1)
-    found = measured(
+    measurement = measured(
         lambda: None, lambda _: paper_forms.direct_correlations(a[0], b, grid)[None]
     )
-    job.report_values("Eq. 8, direct", found, found.answer, grid)
+    job.report_values("Eq. 8, direct", measurement, measurement.answer, grid)
     # Weighted by solid angles the sum of Eq. 5 approximates the integral of Eq. 8.
     values, nodes, side = data["weighted"][0], data["function_nodes"], int(data["side"])
 
@@ -195,21 +197,21 @@ def brute(job):
         return sampled(values, data["directions"], nodes, side, rotations)[None]
 
     # Compiled before the clock starts.
-    found = measured(lambda: sums(grid[:2]), lambda _: sums(grid))
-    job.report_values("Eq. 5, 151 directions", found, found.answer, grid)
+    measurement = measured(lambda: sums(grid[:2]), lambda _: sums(grid))
+    job.report_values("Eq. 5, 151 directions", measurement, measurement.answer, grid)
     brute_abrdf(job, grid)
 
 
 def brute_abrdf(job, grid):
     """Eq. 10 and 3; they take seconds from L = 16 on."""
     (a,), b = job.abrdfs(1)
-    found = measured(
+    measurement = measured(
         lambda: None, lambda _: paper_forms.direct_abrdf_correlations(a, b, grid), 1
     )
-    job.report_rotations("Eq. 10, direct", found, grid[[found.answer.argmax()]])
+    job.report_rotations("Eq. 10, direct", measurement, grid[[measurement.answer.argmax()]])
     data = job.data
     nodes, side, directions = data["nodes"], int(data["side"]), data["directions"]
-    found = measured(
+    measurement = measured(
         lambda: paper_forms.sampled_abrdf_correlations(
             data["samples"][0], directions, nodes, side, grid[:2]
         ),
@@ -218,7 +220,9 @@ def brute_abrdf(job, grid):
         ),
         1,
     )
-    job.report_rotations("Eq. 3, 151 x 151 samples", found, grid[[found.answer.argmax()]])
+    job.report_rotations(
+        "Eq. 3, 151 x 151 samples", measurement, grid[[measurement.answer.argmax()]]
+    )
 
 
 # --- peers --------------------------------------------------------------------------------
@@ -230,10 +234,10 @@ def s2fft(job):
     # Once unmeasured: importing JAX is not what the method needs.
     peer = S2fft(job.band_limit)
     left, right = peer.coefficients(a), peer.coefficients(np.broadcast_to(b, a.shape))
-    found = measured(
+    measurement = measured(
         lambda: S2fft(job.band_limit), lambda fresh: fresh.correlations(left, right)
     )
-    job.report_values("s2fft", found, found.answer, peer.rotations)
+    job.report_values("s2fft", measurement, measurement.answer, peer.rotations)
     for rank in RANKS:
         best = fastest(s2fft_of_batch(job, peer, rank, batch) for batch in BATCHES)
         rotations = peer.rotations[best.answer]
@@ -278,7 +282,7 @@ def pysofft(job):
 
 def fastest(tried):
     """The measurement of least time."""
-    return min(tried, key=lambda found: found.seconds)
+    return min(tried, key=lambda measurement: measurement.seconds)
 
 
 # --- memory -------------------------------------------------------------------------------
@@ -299,7 +303,7 @@ class Repeated:
 def memory(job, n):
     """Peak of a whole harmonic alignment of n texels, read block by block."""
     directions, samples = job.data["directions"], job.data["samples"]
-    found = measured(
+    measurement = measured(
         lambda: align(samples[:2], directions, directions, job.band_limit, refine=False),
         lambda _: align(
             Repeated(samples, n),
@@ -311,7 +315,7 @@ def memory(job, n):
         ),
         1,
     )
-    job.report(3, f"{n} ABRDFs aligned", found, n)
+    job.report(3, f"{n} ABRDFs aligned", measurement, n)
 
 
 METHODS = {"ours": ours, "brute": brute, "s2fft": s2fft, "pysofft": pysofft}

@@ -18,17 +18,17 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / "examples")]
+sys.path.insert(0, str(HERE.parent))
 
 import numpy as np  # noqa: E402
 from benchmarks.measuring import Results  # noqa: E402
-from scipy.optimize import linear_sum_assignment  # noqa: E402
-from synthetic_btf import (  # noqa: E402
+from benchmarks.synthetic_btf import (  # noqa: E402
     dome_directions,
     frame_errors,
     relief_frames,
     sample_texels,
 )
+from scipy.optimize import linear_sum_assignment  # noqa: E402
 
 from reflfield.alignment import align  # noqa: E402
 
@@ -51,11 +51,11 @@ SETS = {
 }
 
 
-def agreement(found, label):
+def agreement(labels, label):
     """Share of equal labels under the best matching of clusters and materials."""
-    size = max(found.max(), label.max()) + 1
+    size = max(labels.max(), label.max()) + 1
     table = np.zeros((size, size), int)
-    np.add.at(table, (found, label), 1)
+    np.add.at(table, (labels, label), 1)
     return table[linear_sum_assignment(-table)].sum() / len(label)
 
 
@@ -77,16 +77,16 @@ def compare(name, materials, options, results):
     rng = np.random.default_rng(3)
     samples, d, frames, label = mixture(materials, options.texels, options.noise, rng)
     start = time.perf_counter(), time.process_time()
-    found = align(samples, d, d, n_clusters=len(materials), n_threads=options.threads)
+    alignment = align(samples, d, d, n_clusters=len(materials), n_threads=options.threads)
     wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
-    together = frame_errors(found.local_from_base, frames)[0]
+    together = frame_errors(alignment.local_from_base, frames)[0]
     alone = np.zeros(len(frames))
     for k in range(len(materials)):
         mine = label == k
         single = align(samples[mine], d, d, n_threads=options.threads)
         alone[mine] = frame_errors(single.local_from_base, frames[mine])[0]
     print(
-        f"{name:15s} labels {100 * agreement(found.cluster, label):6.2f} %   normals mean "
+        f"{name:15s} labels {100 * agreement(alignment.cluster, label):6.2f} %   normals mean "
         f"{together.mean():.3f} (alone {alone.mean():.3f}) 95 % "
         f"{np.percentile(together, 95):.3f} (alone {np.percentile(alone, 95):.3f})   "
         f"{wall:.0f} s ({cpu:.0f} s of processors)",
@@ -95,7 +95,7 @@ def compare(name, materials, options, results):
     results.add(
         {
             "materials": name,
-            "labels right, %": 100 * agreement(found.cluster, label),
+            "labels right, %": 100 * agreement(alignment.cluster, label),
             "normals, mean degrees": together.mean(),
             "each alone": alone.mean(),
             "wall time, s": wall,

@@ -157,8 +157,8 @@ def completion(pattern, sizes, limits):
         ("randomized_svd, row means filled in", lambda: by_randomized_svd(data, RANK)),
         ("(bound: true subspace known)", lambda: with_true_subspace(data, RANK)),
     ]:
-        found, seconds, megabytes = measured(call)
-        row(label, unobserved_error(found, data, DETERMINED), seconds, megabytes)
+        completed, seconds, megabytes = measured(call)
+        row(label, unobserved_error(completed, data, DETERMINED), seconds, megabytes)
     two, four, _, brand_four = errors.values()
     target("error", two if pattern == "random" else four, limits[pattern])
     if pattern == "hemispheric":

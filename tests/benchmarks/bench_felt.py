@@ -91,25 +91,25 @@ def random_frames(rng, n, tilt):
     return np.swapaxes(Rotation.from_euler("ZYZ", angles).as_matrix(), 1, 2)
 
 
-def frame_errors(found, truth):
+def frame_errors(recovered, truth):
     """Angles between normals, and turns about the normal that are left, degrees."""
-    between = found @ np.swapaxes(truth, 1, 2)
+    between = recovered @ np.swapaxes(truth, 1, 2)
     normal = np.arctan2(np.hypot(between[:, 0, 2], between[:, 1, 2]), between[:, 2, 2])
     turn = np.arctan2(between[:, 0, 1] - between[:, 1, 0], between[:, 0, 0] + between[:, 1, 1])
     return np.rad2deg(normal), np.rad2deg(np.abs(turn))
 
 
-def without_common_turn(found, truth):
+def without_common_turn(recovered, truth):
     """Found frames less the turn of all that brings them closest to the truth (robustly)."""
     turn = np.eye(3)
     for _ in range(20):
-        between = np.einsum("ij,njk,nlk->nil", turn, found, truth)
+        between = np.einsum("ij,njk,nlk->nil", turn, recovered, truth)
         angle = Rotation.from_matrix(between).magnitude()
         weights = 1.0 / np.maximum(angle, np.deg2rad(0.2))
-        total = np.einsum("n,nij,nkj->ik", weights, truth, found)
+        total = np.einsum("n,nij,nkj->ik", weights, truth, recovered)
         u, _, vt = np.linalg.svd(total)
         turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return turn @ found
+    return turn @ recovered
 
 
 def mean_normal_error(truth):

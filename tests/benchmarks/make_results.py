@@ -110,12 +110,12 @@ def mark(result):
 
 def marks(text):
     """The marks in a page, each below the heading that it belongs to."""
-    heading, found = "", []
+    heading, notes = "", []
     for line in text.splitlines():
         heading = line.removeprefix("## ") if line.startswith("## ") else heading
         if line.startswith(MARK):
-            found.append(f"{heading}: {line.removeprefix('> ')}")
-    return found
+            notes.append(f"{heading}: {line.removeprefix('> ')}")
+    return notes
 
 
 def without_marks(text):

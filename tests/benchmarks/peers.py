@@ -76,11 +76,11 @@ class S2fft:
 
         def run(factors):
             view, light = factors
-            found = [
+            parts = [
                 compiled(view[k : k + batch], light[k : k + batch])
                 for k in range(0, len(view), batch)
             ]
-            return np.concatenate([np.asarray(part) for part in found])
+            return np.concatenate([np.asarray(part) for part in parts])
 
         return run
 

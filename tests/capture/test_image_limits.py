@@ -135,8 +135,8 @@ for number in range({len(HOSTILE)}):
     lines = run_python(code).splitlines()
     assert len(lines) == len(HOSTILE)
     for number, line in enumerate(lines):
-        taken, seconds, text = line.split(maxsplit=2)
-        assert int(taken) < MOST_BYTES, text
+        memory, seconds, text = line.split(maxsplit=2)
+        assert int(memory) < MOST_BYTES, text
         assert float(seconds) < MOST_SECONDS, text
         assert f"{number}.img: expected" in text
 

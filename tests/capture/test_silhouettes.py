@@ -35,37 +35,37 @@ class TestUniformBackdrop:
     @pytest.mark.parametrize(("front", "back"), [(0.6, 0.0), (0.5, 0.004), (0.05, 0.9)])
     def test_disc_is_found_with_its_soft_edge(self, front, back):
         truth = disc()
-        found = silhouette_from_photographs([composed(truth, front, back)])
-        assert found.dtype == np.float32
-        assert (found.min(), found.max()) == (0, 1)
-        assert overlap(found, truth) > 0.99
+        silhouette = silhouette_from_photographs([composed(truth, front, back)])
+        assert silhouette.dtype == np.float32
+        assert (silhouette.min(), silhouette.max()) == (0, 1)
+        assert overlap(silhouette, truth) > 0.99
         # sub-pixel: the area is right to a twentieth of a pixel along the outline
-        assert abs(found.sum() - truth.sum()) < 2 * np.pi * 45 / 20
+        assert abs(silhouette.sum() - truth.sum()) < 2 * np.pi * 45 / 20
 
     def test_scale_of_the_photographs_does_not_matter(self, rounding):
         photograph = composed(disc(), 0.5, 0.0)
         reference = silhouette_from_photographs([photograph])
         for scale in (2.0**-20, 2.0**20):
-            found = silhouette_from_photographs([photograph * np.float32(scale)])
-            np.testing.assert_allclose(found, reference, atol=rounding(np.float32, 20))
+            silhouette = silhouette_from_photographs([photograph * np.float32(scale)])
+            np.testing.assert_allclose(silhouette, reference, atol=rounding(np.float32, 20))
 
     def test_part_in_shadow_is_found_under_another_light(self):
         truth = disc()
         left = np.where(np.arange(SIZE) < 80, 0.6, 0.0)[None, :, None]
         right = 0.6 - left
-        found = silhouette_from_photographs(
+        silhouette = silhouette_from_photographs(
             composed(truth, side, 0.0) for side in (left, right)
         )
-        assert overlap(found, truth) > 0.99
+        assert overlap(silhouette, truth) > 0.99
 
     def test_small_dark_parts_are_filled_and_large_holes_kept(self):
         body = disc()
         body[78:82, 60:66] = 0  # a crease
-        found = silhouette_from_photographs([composed(body, 0.6, 0.0)])
-        assert (found[78:82, 60:66] == 1).all()
+        silhouette = silhouette_from_photographs([composed(body, 0.6, 0.0)])
+        assert (silhouette[78:82, 60:66] == 1).all()
         ring = disc() - disc(radius=20)
-        found = silhouette_from_photographs([composed(ring, 0.6, 0.0)])
-        assert overlap(found, ring) > 0.98
+        silhouette = silhouette_from_photographs([composed(ring, 0.6, 0.0)])
+        assert overlap(silhouette, ring) > 0.98
 
     def test_specks_are_dropped_and_second_parts_kept(self):
         two = np.maximum(disc((50, 60), 28), disc((120, 110), 20))
@@ -88,19 +88,19 @@ class TestUniformBackdrop:
         # lit from the left only: the right half gets a hundredth
         front = np.where(np.arange(SIZE) < 80, 0.6, 0.006)[None, :, None]
         truth = disc()
-        found = silhouette_from_photographs([composed(truth, front, 0.0)])
-        assert overlap(found, truth) > 0.97
+        silhouette = silhouette_from_photographs([composed(truth, front, 0.0)])
+        assert overlap(silhouette, truth) > 0.97
 
     def test_faint_glow_is_followed_only_near_the_object(self):
         photograph = composed(disc(), 0.6, 0.0)
         photograph[79:82, 125:158] = 0.6 * decode_srgb(0.03)  # a thread of lit cloth
-        found = silhouette_from_photographs([photograph])
-        assert (found[:, 135:] == 0).all()
+        silhouette = silhouette_from_photographs([photograph])
+        assert (silhouette[:, 135:] == 0).all()
 
     def test_object_may_leave_the_frame(self):
         truth = disc((80, 10), 45)
-        found = silhouette_from_photographs([composed(truth, 0.6, 0.0)])
-        assert overlap(found, truth) > 0.98
+        silhouette = silhouette_from_photographs([composed(truth, 0.6, 0.0)])
+        assert overlap(silhouette, truth) > 0.98
 
     def test_noise_and_uneven_backdrop(self, rng):
         truth = disc()
@@ -119,8 +119,8 @@ class TestGrabCut:
         return np.clip(photograph + rng.normal(scale=0.01, size=photograph.shape), 0, 1)
 
     def test_cluttered_backdrop(self, rng):
-        found = silhouette_from_photographs([self.cluttered(rng).astype(np.float32)])
-        assert overlap(found, disc()) > 0.95
+        silhouette = silhouette_from_photographs([self.cluttered(rng).astype(np.float32)])
+        assert overlap(silhouette, disc()) > 0.95
 
     def test_same_answer_twice(self, rng):
         photograph = self.cluttered(rng).astype(np.float32)
@@ -152,9 +152,11 @@ def test_simulated_dome_photographs(shared_data):
     capture = open_capture(shared_data("mitsuba_spot"))
     for view in (0, 9, 21):
         chosen = capture.photograph_index[view, ::4]
-        found = silhouette_from_photographs(capture.read_photograph(int(i)) for i in chosen)
+        silhouette = silhouette_from_photographs(
+            capture.read_photograph(int(i)) for i in chosen
+        )
         # some of it is in shadow under all of them: .935 to .966 measured over all views
-        assert overlap(found, capture.read_silhouette(view)) > 0.92
+        assert overlap(silhouette, capture.read_silhouette(view)) > 0.92
 
 
 class TestMiddlebury:

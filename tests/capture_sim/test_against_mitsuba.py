@@ -73,8 +73,8 @@ def with_tangents_per_face(mesh, *, flat=False):
     area = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
     tangent = (dv[:, 1:] * edges[:, 0] - dv[:, :1] * edges[:, 1]) * np.sign(area)[:, None]
     length = np.linalg.norm(tangent, axis=1, keepdims=True)
-    given = mesh.tangents[mesh.faces[:, 0]]
-    tangent = np.where(length > 0.0, tangent / np.where(length > 0.0, length, 1.0), given)
+    stored = mesh.tangents[mesh.faces[:, 0]]
+    tangent = np.where(length > 0.0, tangent / np.where(length > 0.0, length, 1.0), stored)
     normals = mesh.normals[mesh.faces]
     if flat:
         normal = np.cross(edges[:, 0], edges[:, 1])

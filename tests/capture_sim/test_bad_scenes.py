@@ -95,9 +95,9 @@ def test_winding_number_against_the_radius(rng):
 
 
 def test_flawless_meshes_are_left_alone(ball):
-    found = repaired(*ball, None)
-    assert found.notes == ()
-    assert found.faces is ball[1] or (found.faces == ball[1]).all()
+    mesh = repaired(*ball, None)
+    assert mesh.notes == ()
+    assert mesh.faces is ball[1] or (mesh.faces == ball[1]).all()
 
 
 def test_empty_and_repeated_faces_are_dropped(tmp_path, ball):

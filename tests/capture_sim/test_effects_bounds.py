@@ -77,9 +77,9 @@ def test_changes_stay_below_their_bounds(thing, material, parameters):
     tracer = RayTracer(described.mesh)
     known = measured(described, tracer)
     bounds = {effect.NAME: effect.needed(known).bound for effect in EFFECTS}
-    found = contributions(known, tracer, some_pairs(known, 3))
-    assert {one.name for one in found} >= {"antialiasing", "near_lights", "pose_error"}
-    broken = {one.name: (one.change, bounds[one.name]) for one in found}
+    shares = contributions(known, tracer, some_pairs(known, 3))
+    assert {one.name for one in shares} >= {"antialiasing", "near_lights", "pose_error"}
+    broken = {one.name: (one.change, bounds[one.name]) for one in shares}
     broken = {name: pair for name, pair in broken.items() if pair[0] > pair[1]}
     assert broken == {}
 
@@ -100,8 +100,8 @@ def test_what_auto_leaves_out_is_below_the_tolerance():
     forced = measured(
         scene("sphere", "satin", simulate=[*auto.effects.active, *tiny], **tiny), tracer
     )
-    found = contributions(forced, tracer, some_pairs(forced, 3))
-    changes = {one.name: one.change for one in found if one.name in tiny}
+    shares = contributions(forced, tracer, some_pairs(forced, 3))
+    changes = {one.name: one.change for one in shares if one.name in tiny}
     assert set(changes) == set(tiny)
     assert max(changes.values()) <= auto.effects.tolerance
     assert max(changes.values()) > 0.0
@@ -110,13 +110,13 @@ def test_what_auto_leaves_out_is_below_the_tolerance():
 def test_differences_are_what_the_effect_added():
     described = scene("sphere", "satin", environment={"samples": 16}, vignetting={})
     tracer = RayTracer(described.mesh)
-    found = {
+    shares = {
         one.name: one
         for one in contributions(measured(described, tracer), tracer, [(0, 0), (2, 2)])
     }
-    assert set(found["environment"].differences) == {(0, 0), (2, 2)}
-    assert found["environment"].differences[2, 2].min() >= 0.0
-    assert found["vignetting"].differences[2, 2].max() <= 0.0
+    assert set(shares["environment"].differences) == {(0, 0), (2, 2)}
+    assert shares["environment"].differences[2, 2].min() >= 0.0
+    assert shares["vignetting"].differences[2, 2].max() <= 0.0
 
 
 def test_the_sensors_own_noise_is_a_tolerance():

@@ -56,9 +56,9 @@ def test_disc_diameter_by_tracing_two_rays_through_the_lens():
         image = 1.0 / (1.0 / focal - 1.0 / depth)
         aperture = focal / 2.0
         blur = aperture * abs(image - sensor) / image
-        found = defocus.disc_diameter(camera, np.array([depth]), options, thing)[0]
+        diameter = defocus.disc_diameter(camera, np.array([depth]), options, thing)[0]
         # The camera's focal length in pixels is taken for that of the lens.
-        assert found == pytest.approx(blur / pitch, rel=1e-9, abs=1e-12)
+        assert diameter == pytest.approx(blur / pitch, rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("diameter", [0.5, 1.0, 3.0, 7.5])

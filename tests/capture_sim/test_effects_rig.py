@@ -150,10 +150,10 @@ def test_fall_off_is_a_power_of_the_cosine_about_the_object():
 
 def test_photographs_are_dropped_with_the_given_probability():
     thing = scene(n=40, dropped_photographs={"fraction": 0.1})
-    taken = real_rig(thing).photographed
-    assert taken.shape == (40, 40)
-    assert (~taken).mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.1 * 0.9 / 1600))
-    assert str((~taken).sum()) in dropped_photographs.needed(thing).reason
+    photographed = real_rig(thing).photographed
+    assert photographed.shape == (40, 40)
+    assert (~photographed).mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.1 * 0.9 / 1600))
+    assert str((~photographed).sum()) in dropped_photographs.needed(thing).reason
 
 
 def test_losing_every_photograph_is_refused():

@@ -61,9 +61,9 @@ def test_malvar_interpolation_is_that_of_the_paper(rng, rounding):
 def test_demosaicing_keeps_flat_colours_and_what_was_seen(rng, kind):
     thing = scene(bayer={"demosaicing": kind})
     flat = np.broadcast_to(np.float32([0.2, 0.5, 0.9]), (10, 12, 3))
-    found = bayer.apply(bayer.mosaic(flat), thing)
+    demosaiced = bayer.apply(bayer.mosaic(flat), thing)
     # Grey is kept by all filters, a colour by those without gradients of others.
-    np.testing.assert_allclose(found[2:-2, 2:-2], flat[2:-2, 2:-2], atol=1e-6)
+    np.testing.assert_allclose(demosaiced[2:-2, 2:-2], flat[2:-2, 2:-2], atol=1e-6)
     image = rng.random((10, 12, 3)).astype(np.float32)
     again = bayer.mosaic(bayer.apply(bayer.mosaic(image), thing))
     np.testing.assert_allclose(again, bayer.mosaic(image), atol=1e-6)
@@ -190,11 +190,11 @@ def test_merged_exposures_recover_radiance_within_the_predicted_variance(rng):
 def test_best_exposure_errs_by_half_a_code():
     thing = scene(exposure_brackets={"seconds": [0.1, 1.0]})
     radiance = np.linspace(0.01, 9.0, 300, dtype=np.float32).reshape(10, 10, 3)
-    found = exposure_brackets.best_exposure(radiance, thing)
+    merged = exposure_brackets.best_exposure(radiance, thing)
     # Half of 1/255 times the largest slope of the decoding, 2.4 / 1.055, in radiance.
     largest = 0.5 / 255 * 2.4 / 1.055
-    assert np.abs(found - radiance)[radiance < 0.99].max() < largest
-    assert np.abs(found - radiance).max() < largest * 10
+    assert np.abs(merged - radiance)[radiance < 0.99].max() < largest
+    assert np.abs(merged - radiance).max() < largest * 10
 
 
 @pytest.mark.parametrize("effect", [bayer, black_level, quantisation, saturation])

@@ -44,18 +44,18 @@ def test_the_plan_is_right(name):
     scene = small(name)
     tracer = RayTracer(scene.mesh, n_threads=2)
     known = measured(scene, tracer)
-    found = {one.name: one for one in contributions(known, tracer, some_pairs(known, 3))}
+    shares = {one.name: one for one in contributions(known, tracer, some_pairs(known, 3))}
     on = known.effects.active
     wrong = {}
     for effect in EFFECTS:
-        if effect.NAME in NO_PICTURE or effect.NAME not in found:
+        if effect.NAME in NO_PICTURE or effect.NAME not in shares:
             continue
-        change, bound = found[effect.NAME].change, effect.needed(known).bound
+        change, bound = shares[effect.NAME].change, effect.needed(known).bound
         visible = change > threshold(known, effect.STAGE)
         if visible is not (effect.NAME in on) or change > bound:
             wrong[effect.NAME] = (change, bound)
     assert wrong == {}
-    assert {"antialiasing", "near_lights", "shadows"} <= set(found)
+    assert {"antialiasing", "near_lights", "shadows"} <= set(shares)
 
 
 def test_presets_call_for_different_effects():

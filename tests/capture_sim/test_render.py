@@ -252,14 +252,14 @@ def test_outlines_are_found_as_by_searching_everywhere(thing, monkeypatch):
         cameras={"width": 96, "height": 96, "target": [0, 0, 0.05]},
     )
     tracer = RayTracer(scene.mesh)
-    found = sample_view(scene, tracer, scene.cameras[0])
+    samples = sample_view(scene, tracer, scene.cameras[0])
     monkeypatch.setattr(
         view_samples, "_near_outline", lambda searched, *_: searched.coverage >= 0.0
     )
     everywhere = sample_view(scene, tracer, scene.cameras[0])
-    assert ((found.coverage > 0) & (found.coverage < 1)).sum() > 50
-    assert (found.coverage == everywhere.coverage).all()
-    assert (found.pixel == everywhere.pixel).all()
+    assert ((samples.coverage > 0) & (samples.coverage < 1)).sum() > 50
+    assert (samples.coverage == everywhere.coverage).all()
+    assert (samples.pixel == everywhere.pixel).all()
 
 
 def test_radiance_is_linear_in_the_light(rounding):

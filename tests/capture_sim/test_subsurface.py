@@ -74,8 +74,8 @@ def test_evenly_lit_plate_is_lambertian_away_from_its_rim():
         edge = 0.05 - abs(-0.06 + 0.005 * (column + 0.5))
         beyond = lambda r, e=edge: 2 * r * np.arccos(e / r) * dipole.profile(np.array(r))  # noqa: E731
         expected = 1.0 - quad(beyond, edge, 0.08, limit=200)[0] / 0.8
-        found = image[0, 11:13, column, 0] / lambert[0, 11:13, column, 0]
-        np.testing.assert_allclose(found, expected, atol=7e-3)
+        ratio = image[0, 11:13, column, 0] / lambert[0, 11:13, column, 0]
+        np.testing.assert_allclose(ratio, expected, atol=7e-3)
 
 
 def test_spot_of_light_spreads_as_the_integral_says():
@@ -106,11 +106,11 @@ def test_spot_of_light_spreads_as_the_integral_says():
         return (0.3 / np.sqrt(d2)) ** 2001 / d2
 
     dipole = scene.material.dipoles[0]
-    for found, at in zip(change, x, strict=True):
+    for measured, at in zip(change, x, strict=True):
         radiance = np.sum(ring_weights(dipole) * irradiance(at + RING_X, RING_Y)) / np.pi
         lambert = 0.8 / np.pi * irradiance(at, 0.0)
         # One per cent of the brightest body light: grid of a quarter of a length.
-        assert found + lambert == pytest.approx(radiance, abs=0.01 * 0.8 / np.pi / 0.09)
+        assert measured + lambert == pytest.approx(radiance, abs=0.01 * 0.8 / np.pi / 0.09)
     assert abs(change[0]) > 0.1 * 0.8 / np.pi / 0.09
 
 
@@ -166,8 +166,8 @@ def test_areas_of_nodes_add_up_to_the_surface():
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
     nodes = subsurface.Nodes.of(mesh, 0.004)
-    found = subsurface.node_areas(mesh, nodes).sum()
-    assert found == pytest.approx(0.5 * area.sum(), rel=1e-12)
+    total = subsurface.node_areas(mesh, nodes).sum()
+    assert total == pytest.approx(0.5 * area.sum(), rel=1e-12)
 
 
 def test_free_when_off_and_called_for_by_the_material(monkeypatch):

@@ -187,8 +187,8 @@ def test_every_source_gives_the_same_answer(rng, tmp_path):
     }
     reference = reconstructed(complete(data.measured, data.observed, rank=3))
     for name, source in sources.items():
-        found = reconstructed(complete(source, rank=3, block=64))
-        assert np.sqrt(((found - reference) ** 2).mean()) < 0.004, name
+        completed = reconstructed(complete(source, rank=3, block=64))
+        assert np.sqrt(((completed - reference) ** 2).mean()) < 0.004, name
 
 
 def test_unobserved_values_are_never_used(rng):
@@ -212,8 +212,8 @@ def test_unit_does_not_matter(rng, scale, dtype):
     measured = data.measured.astype(dtype) * dtype(scale)
     fit = complete(measured, data.observed, rank=2)
     assert fit.basis.dtype == dtype
-    found = reconstructed(fit).astype(np.float64) / scale
-    assert unobserved_error(found, data) < 0.01
+    completed = reconstructed(fit).astype(np.float64) / scale
+    assert unobserved_error(completed, data) < 0.01
     assert fit.noise / scale == pytest.approx(0.01, rel=0.1)
 
 
@@ -246,9 +246,9 @@ def test_single_row():
     row = np.array([[1.0, 2.0, np.nan, 4.0]])
     fit = complete(row, rank=3)
     assert fit.rank == 1
-    found = reconstructed(fit)
+    completed = reconstructed(fit)
     # One row cannot tell signal from noise: right to within the noise that is reported.
-    assert np.nanmax(np.abs(found - row)) < 2 * fit.noise
+    assert np.nanmax(np.abs(completed - row)) < 2 * fit.noise
     assert (fit.coverage == 0).tolist() == [False, False, True, False]
 
 
@@ -257,8 +257,8 @@ def test_condition_1e12_keeps_the_large_directions(rng):
     left = np.linalg.qr(rng.standard_normal((80, 3)))[0]
     truth = (left * [1.0, 1e-6, 1e-12]) @ rng.standard_normal((3, 200))
     seen = rng.random(truth.shape) < 0.6
-    found = reconstructed(complete(truth, seen, rank=3, passes=8))
-    assert np.abs(found - truth).max() < 1e-5 * np.abs(truth).max()
+    completed = reconstructed(complete(truth, seen, rank=3, passes=8))
+    assert np.abs(completed - truth).max() < 1e-5 * np.abs(truth).max()
 
 
 @pytest.mark.stability
@@ -317,7 +317,7 @@ def test_columns_that_are_all_sparse_shape_the_basis_together(rng):
     """Of each one in a hundred entries: no column reaches the usual share."""
     truth = rng.standard_normal((1000, 2)) @ rng.standard_normal((2, 600)) + 3.0
     observed = rng.random(truth.shape) < 0.012
-    found = complete(truth, observed, rank=3, passes=4, seed=0)
-    assert found.sparse_columns.mean() < 0.2
-    error = (reconstructed(found, np.arange(600)) - truth)[observed]
+    fit = complete(truth, observed, rank=3, passes=4, seed=0)
+    assert fit.sparse_columns.mean() < 0.2
+    error = (reconstructed(fit, np.arange(600)) - truth)[observed]
     assert np.sqrt(np.mean(error**2)) < 0.3 * np.sqrt(np.mean(truth**2))

@@ -35,17 +35,17 @@ class TestAgreement:
     @pytest.mark.reference
     def test_with_the_completion_on_its_own_columns(self, planted):
         fit, data = planted
-        found, coverage = infer(fit, data, slice(0, 400))
+        coefficients, coverage = infer(fit, data, slice(0, 400))
         # Against some forty samples the prior weighs noise^2 / 40, about 3e-6; the two
         # priors differ by the posterior covariance, which the completion counts.
         size = np.sqrt((fit.coefficients**2).mean())
-        assert np.abs(found - fit.coefficients).max() < 1e-4 * size
+        assert np.abs(coefficients - fit.coefficients).max() < 1e-4 * size
         assert np.allclose(coverage, fit.coverage, rtol=1e-6)  # coverage is float32
 
     @pytest.mark.reference
     def test_with_ridge_regression(self, planted, rounding):
         fit, data = planted
-        found, _ = infer(fit, data, slice(400, 420))
+        coefficients, _ = infer(fit, data, slice(400, 420))
         used = fit.coefficients
         prior = fit.noise**2 * np.linalg.solve(used.T @ used / len(used), np.eye(4))
         for j in range(20):
@@ -54,12 +54,12 @@ class TestAgreement:
             expected = np.linalg.solve(basis.T @ basis + prior, basis.T @ rest)
             # The answer is float32.
             tolerance = rounding(np.float32, scale=np.abs(expected).max())
-            assert np.abs(found[j] - expected).max() < tolerance
+            assert np.abs(coefficients[j] - expected).max() < tolerance
 
     def test_with_the_truth_on_new_columns(self, planted):
         fit, data = planted
-        found, _ = infer(fit, data, slice(400, 500))
-        error = reconstructed(fit, found) - data.truth[:, 400:]
+        coefficients, _ = infer(fit, data, slice(400, 500))
+        error = reconstructed(fit, coefficients) - data.truth[:, 400:]
         # 4 coefficients from about 40 samples: noise * sqrt(4 / 40), and as much for the
         # basis; three times that.
         assert np.sqrt((error**2).mean()) < 3 * 0.01 * np.sqrt(2 * 4 / 40)
@@ -80,9 +80,9 @@ class TestInvariance:
         one, _ = infer(fit, data, slice(400, 500))
         scaled = data._replace(measured=data.measured * scale)
         fit = complete(scaled.measured[:, :400], scaled.observed[:, :400], rank=4)
-        found, _ = infer(fit, scaled, slice(400, 500))
+        coefficients, _ = infer(fit, scaled, slice(400, 500))
         # The scale is no power of two: rounding differs and is amplified by the passes.
-        error = np.abs(found.astype(np.float64) / scale - one).max()
+        error = np.abs(coefficients.astype(np.float64) / scale - one).max()
         assert error < 1e-5 * np.abs(one).max()
 
     def test_channels_share_their_weights(self, planted):
@@ -100,8 +100,8 @@ class TestInvariance:
 class TestDegenerate:
     def test_column_without_samples_is_the_mean(self, planted):
         fit, _ = planted
-        found, coverage = infer_coefficients(fit, np.full((81, 2), np.nan))
-        assert not found.any()
+        coefficients, coverage = infer_coefficients(fit, np.full((81, 2), np.nan))
+        assert not coefficients.any()
         assert not coverage.any()
 
     def test_values_not_observed_are_not_read(self, planted):
@@ -120,16 +120,16 @@ class TestDegenerate:
         fit = complete(truth, rank=5)
         lone = np.full((30, 1), np.nan, dtype)
         lone[3] = truth[3, 5]
-        found, _ = infer_coefficients(fit, lone)
+        coefficients, _ = infer_coefficients(fit, lone)
         # The prior knows the one direction that the data have, up to its floor of 1e-9.
-        assert np.allclose(reconstructed(fit, found)[:, 0], truth[:, 5], rtol=1e-3)
+        assert np.allclose(reconstructed(fit, coefficients)[:, 0], truth[:, 5], rtol=1e-3)
 
     def test_no_column_shaped_the_prior(self, planted):
         """All columns too sparse: coefficients vanish rather than fail."""
         fit, _ = planted
         barren = type(fit)(**{**vars(fit), "sparse_columns": np.ones(400, bool)})
-        found, _ = infer_coefficients(barren, np.ones((81, 2)))
-        assert np.isfinite(found).all()
+        coefficients, _ = infer_coefficients(barren, np.ones((81, 2)))
+        assert np.isfinite(coefficients).all()
 
     def test_other_rows_are_refused(self, planted):
         fit, _ = planted

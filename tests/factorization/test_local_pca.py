@@ -27,10 +27,14 @@ def test_error_is_that_of_the_reconstruction(rng):
     columns, _ = clustered_subspaces(rng, n_columns=400)
     for n_clusters, n_components in ((4, 2), (1, 2), (4, 0)):
         fit = LocalPCA(n_clusters, n_components).fit(columns)
-        found = reconstructed(fit)
-        assert fit.residual == pytest.approx(np.sqrt(((columns - found) ** 2).mean()), rel=1e-4)
-        np.testing.assert_allclose(reconstructed(fit, 7), found[:, 7:8], atol=1e-5)
-        np.testing.assert_allclose(reconstructed(fit, slice(2, 9)), found[:, 2:9], atol=1e-5)
+        approximation = reconstructed(fit)
+        assert fit.residual == pytest.approx(
+            np.sqrt(((columns - approximation) ** 2).mean()), rel=1e-4
+        )
+        np.testing.assert_allclose(reconstructed(fit, 7), approximation[:, 7:8], atol=1e-5)
+        np.testing.assert_allclose(
+            reconstructed(fit, slice(2, 9)), approximation[:, 2:9], atol=1e-5
+        )
 
 
 @pytest.mark.reference

@@ -126,8 +126,8 @@ def test_basis_stays_orthonormal(rng, name, dtype):
     if svd.basis.size:
         assert departure(svd.basis) < LIMIT[dtype]
     values = np.zeros(len(svd.singular_values))
-    found = np.linalg.svd(matrix.astype(np.float64), compute_uv=False)[: len(values)]
-    values[: len(found)] = found
+    singular = np.linalg.svd(matrix.astype(np.float64), compute_uv=False)[: len(values)]
+    values[: len(singular)] = singular
     # Backward stable: absolute accuracy on the scale of the largest.
     np.testing.assert_allclose(
         svd.singular_values, values, atol=LIMIT[dtype] * max(values, default=0.0), rtol=0

@@ -43,14 +43,16 @@ def posterior_of(model, block, j):
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 def test_posterior_is_that_of_the_gaussian_model(rng, offset):
     model, block = small_case(rng, offset=offset)
-    found = infer(model, block, gram_of_samples(model.basis, 2))
+    posterior = infer(model, block, gram_of_samples(model.basis, 2))
     for j in range(5):
         mean, covariance = posterior_of(model, block, j)
-        np.testing.assert_allclose(found.mean[j], mean, rtol=1e-10)
-        np.testing.assert_allclose(found.covariance[j], covariance, rtol=1e-10)
+        np.testing.assert_allclose(posterior.mean[j], mean, rtol=1e-10)
+        np.testing.assert_allclose(posterior.covariance[j], covariance, rtol=1e-10)
         w = np.repeat(block.weights[:, j], 2)
         residual = block.values[:, j] - model.offset - model.basis @ mean
-        assert found.squared_residual[j] == pytest.approx((w * residual**2).sum(), rel=1e-10)
+        assert posterior.squared_residual[j] == pytest.approx(
+            (w * residual**2).sum(), rel=1e-10
+        )
 
 
 def test_rows_minimise_the_expected_squared_residual(rng):

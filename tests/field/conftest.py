@@ -1,4 +1,6 @@
-"""Random fields for the tests of this room."""
+"""Random fields and threads for the tests of this package."""
+
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -47,3 +49,9 @@ def make_field(rng):
         return build_field(surface, fitted, quantisation=quantisation, metadata=metadata)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with ThreadPoolExecutor(2) as pool:
+        yield pool

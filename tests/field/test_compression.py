@@ -117,17 +117,17 @@ class TestPrecision:
     def test_is_noise_over_variance(self, rng):
         labels = np.repeat(np.arange(2, dtype=np.int32), 50)
         coefficients = rng.normal(size=(100, 3))
-        found = _precision(labels, coefficients, 0.3, 2)
+        precision = _precision(labels, coefficients, 0.3, 2)
         for c in range(2):
             expected = 0.09 / coefficients[labels == c].var(axis=0)
-            assert np.allclose(found[c], np.diag(expected), rtol=1e-12)
+            assert np.allclose(precision[c], np.diag(expected), rtol=1e-12)
 
     @pytest.mark.stability
     def test_clusters_without_members(self, rng):
         labels = np.array([0, 0, 2, 2], np.int32)
-        found = _precision(labels, rng.normal(size=(4, 2)), 0.1, 5)
-        assert found.shape == (5, 2, 2)
-        assert (np.linalg.eigvalsh(found) > 0).all()
+        precision = _precision(labels, rng.normal(size=(4, 2)), 0.1, 5)
+        assert precision.shape == (5, 2, 2)
+        assert (np.linalg.eigvalsh(precision) > 0).all()
 
     @pytest.mark.stability
     @pytest.mark.parametrize("scale", [1e-12, 1e12])

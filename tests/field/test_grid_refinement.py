@@ -29,10 +29,10 @@ def values(model, sides, directions):
     out = model.table
     for axis, side in enumerate(sides, start=1):
         nodes, weights = HemisphereGrid(side).taps(directions)
-        taken = np.take(out, nodes, axis=axis)
-        shape = [1] * taken.ndim
+        at_nodes = np.take(out, nodes, axis=axis)
+        shape = [1] * at_nodes.ndim
         shape[axis : axis + 2] = weights.shape
-        out = (taken * weights.reshape(shape)).sum(axis=axis + 1)
+        out = (at_nodes * weights.reshape(shape)).sum(axis=axis + 1)
     return out
 
 
@@ -40,10 +40,10 @@ def values(model, sides, directions):
 def test_functions_stay_where_old_nodes_are_new_ones(sides, finer, rng, rounding):
     model = model_on(rng, *sides)
     directions = HemisphereGrid(8).directions
-    found = on_refined_grid(model, finer)
-    assert found.table.dtype == np.float32
+    refined = on_refined_grid(model, finer)
+    assert refined.table.dtype == np.float32
     np.testing.assert_allclose(
-        values(found, finer, directions),
+        values(refined, finer, directions),
         values(model, sides, directions),
         atol=rounding(np.float32, 32),
     )
@@ -51,8 +51,8 @@ def test_functions_stay_where_old_nodes_are_new_ones(sides, finer, rng, rounding
 
 def test_the_same_sides_change_nothing(rng, rounding):
     model = model_on(rng, 5, 7)
-    found = on_refined_grid(model, (5, 7))
-    np.testing.assert_allclose(found.table, model.table, atol=rounding(np.float32))
+    refined = on_refined_grid(model, (5, 7))
+    np.testing.assert_allclose(refined.table, model.table, atol=rounding(np.float32))
 
 
 def test_a_direction_that_does_not_vary_cannot_begin_to(rng):

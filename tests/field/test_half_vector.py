@@ -120,11 +120,11 @@ def pairs(n=400):
 def test_samples_are_those_of_an_independent_evaluation(model):
     texels, views, lights = pairs()
     exact = reference(model, texels, views, lights)
-    found = evaluate(built(model), texels, views, lights)
+    values = evaluate(built(model), texels, views, lights)
     # Singles: 33 nodes over an arc hyperbolic sine of an arc cosine lose some digits near the
     # pole; random tables differ by 1 from node to node. Frames are stored to .01 degrees.
-    np.testing.assert_allclose(found, exact, atol=0.02)
-    assert np.abs(found - exact).mean() < 1e-3
+    np.testing.assert_allclose(values, exact, atol=0.02)
+    assert np.abs(values - exact).mean() < 1e-3
 
 
 def test_texels_that_do_not_exist_and_lights_below_give_nothing(model):
@@ -158,9 +158,9 @@ def test_quantised_samples_scale_with_the_model(model, scale):
     )
     step = 0.01 * np.cbrt(scale)
     usual = evaluate(built(model, 0.01), texels, views, lights)
-    found = evaluate(built(scaled, step), texels, views, lights)
+    values = evaluate(built(scaled, step), texels, views, lights)
     # Cube roots are rounded in double precision, decoded in singles.
-    np.testing.assert_allclose(found / scale, usual, rtol=2e-2, atol=2e-3)
+    np.testing.assert_allclose(values / scale, usual, rtol=2e-2, atol=2e-3)
 
 
 def test_coarser_steps_make_smaller_files_and_larger_errors(model, tmp_path):

@@ -23,8 +23,8 @@ N_LIGHTS, N_COMPONENTS = 30, 3
 
 
 def directions(rng, n):
-    found = rng.standard_normal((n, 3))
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    vectors = rng.standard_normal((n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def planted(rng, n_texels=400, noise=0.01, share=0.4):
@@ -65,9 +65,9 @@ def fitted(shade, n_components=N_COMPONENTS, n_lights=N_LIGHTS):
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_planted_light_comes_back_where_nothing_was_seen(noise, rng):
     truth, shade = planted(rng, noise=noise)
-    model, found = fitted(shade)
+    model, light = fitted(shade)
     elsewhere = np.broadcast_to(directions(rng, 50), (400, 50, 3))
-    error = domain_values(found, elsewhere) - domain_values(truth, elsewhere)
+    error = domain_values(light, elsewhere) - domain_values(truth, elsewhere)
     # Twelve lights in shadow tell 3 coefficients from 36 numbers: the error is below the noise.
     assert np.sqrt(np.mean(error**2)) < noise
     assert np.sqrt(model.noise) == pytest.approx(noise, rel=0.15)
@@ -77,9 +77,9 @@ def test_more_noise_is_more_error_in_proportion(rng):
     errors = []
     for noise in (0.001, 0.01, 0.1):
         truth, shade = planted(np.random.default_rng(7), noise=noise)
-        found = fitted(shade)[1]
+        light = fitted(shade)[1]
         elsewhere = np.broadcast_to(directions(np.random.default_rng(8), 50), (400, 50, 3))
-        error = domain_values(found, elsewhere) - domain_values(truth, elsewhere)
+        error = domain_values(light, elsewhere) - domain_values(truth, elsewhere)
         errors.append(np.sqrt(np.mean(error**2)))
     slope = np.diff(np.log(errors)) / np.log(10)
     # At noise .1 the limit, the brightest sample known to a tenth (.5), counts for .04 of a
@@ -105,16 +105,16 @@ def test_no_shade_no_energy_and_one_texel_are_defined(rng):
     unseen = Shade(shade.values, 0 * shade.weights, shade.lights)
     black = Shade(0 * shade.values, shade.weights, shade.lights)
     for nothing in (unseen, black):
-        model, found = fitted(nothing)
+        model, light = fitted(nothing)
         assert len(model.variances) == 0
-        assert found.is_black
-        assert found.coefficients.shape == (5, 0)
+        assert light.is_black
+        assert light.coefficients.shape == (5, 0)
     one = some(shade, np.zeros(1, int))
-    model, found = fitted(one)
-    assert np.isfinite(found.functions).all()
-    assert np.isfinite(found.coefficients).all()
+    model, light = fitted(one)
+    assert np.isfinite(light.functions).all()
+    assert np.isfinite(light.coefficients).all()
     seen = one.weights[0] > 0
-    residual = (domain_values(found, one.lights) - one.values)[0, seen]
+    residual = (domain_values(light, one.lights) - one.values)[0, seen]
     assert np.abs(residual).max() < 0.2 * np.abs(one.values).max()
 
 
@@ -125,24 +125,24 @@ def test_object_without_a_texel_in_shadow_has_black_indirect_light(rng):
     model = fit_indirect(
         lambda texels: some(shade, texels), np.zeros(0, np.intp), N_LIGHTS, N_COMPONENTS
     )
-    found = IndirectLight(model.functions(), model.coefficients(some(shade, np.arange(0))))
-    assert found.is_black
-    assert found.coefficients.shape == (0, 0)
+    light = IndirectLight(model.functions(), model.coefficients(some(shade, np.arange(0))))
+    assert light.is_black
+    assert light.coefficients.shape == (0, 0)
 
 
 @pytest.mark.stability
 def test_duplicates_share_one_answer(rng):
     _, shade = planted(rng, n_texels=50)
     twice = some(shade, np.concatenate([np.arange(50), np.arange(50)]))
-    found = fitted(twice)[1]
-    np.testing.assert_allclose(found.coefficients[:50], found.coefficients[50:], atol=1e-5)
+    light = fitted(twice)[1]
+    np.testing.assert_allclose(light.coefficients[:50], light.coefficients[50:], atol=1e-5)
 
 
 def test_texel_in_no_shadow_takes_the_mean(rng):
     _, shade = planted(rng)
     shade.weights[3] = 0
-    found = fitted(shade)[1]
-    assert np.all(found.coefficients[3] == 0)
+    light = fitted(shade)[1]
+    assert np.all(light.coefficients[3] == 0)
 
 
 def test_normal_equations_are_the_sums_they_say(rng):
@@ -203,15 +203,15 @@ def test_lights_from_where_none_came_bring_what_the_nearest_did(rng):
     everywhere = directions(rng, 5000)
     dome = everywhere[covered(everywhere, DOME)]
     shown = light.under(texels, np.concatenate([DOME, dome]), 1)
-    found = light.under(texels, below, 1)
+    radiance = light.under(texels, below, 1)
     # The table interpolates in steps of 2 degrees: h^2 / 8 l (l + 1) of the largest.
     slack = (np.pi / 90) ** 2 / 8 * 12 * shown.max()
-    assert np.all(found.max(axis=1) <= shown.max(axis=1) + slack)
-    assert np.all(found.min(axis=1) >= shown.min(axis=1) - slack)
+    assert np.all(radiance.max(axis=1) <= shown.max(axis=1) + slack)
+    assert np.all(radiance.min(axis=1) >= shown.min(axis=1) - slack)
     unbounded = replace(light, observed=None).under(texels, below, 1)
     assert np.mean(unbounded.max(axis=1) > shown.max(axis=1) + slack) > 0.3
     towards = light.towards(np.repeat(texels, len(below)), np.tile(below, (50, 1)), 1)
-    np.testing.assert_allclose(found.reshape(-1, 3), towards, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(radiance.reshape(-1, 3), towards, rtol=1e-4, atol=1e-5)
 
 
 def test_no_texel_is_made_brighter_than_it_was_seen(monkeypatch, rng):

@@ -24,14 +24,14 @@ def test_size_is_that_of_the_file(build, tmp_path):
 @pytest.mark.parametrize("start", [1e-4, 0.02, 0.5])
 @pytest.mark.parametrize("size", [9_000, 13_000])
 def test_field_of_a_size_comes_close_from_below_wherever_it_begins(build, start, size):
-    found = PackedSizes().of(field_of_size(build, start, size))
-    assert 0.98 * size < found <= size
+    reached = PackedSizes().of(field_of_size(build, start, size))
+    assert 0.98 * size < reached <= size
 
 
 def test_search_for_a_size_begins_without_a_residual(build):
     """A model that explains its samples exactly has a residual, and so a step, of 0."""
-    found = PackedSizes().of(field_of_size(build, 0.0, 9_000))
-    assert 0.98 * 9_000 < found <= 9_000
+    reached = PackedSizes().of(field_of_size(build, 0.0, 9_000))
+    assert 0.98 * 9_000 < reached <= 9_000
 
 
 def test_search_for_a_quality_begins_without_a_residual(build, parts):

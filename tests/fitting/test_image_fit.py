@@ -93,10 +93,10 @@ def test_derivatives_are_those_of_finite_differences(small_rng):
             axis=2,
         )[:, :, unknown]
         weighted = parts[view.entry] * view.share[:, None, None]
-        found = np.add.reduceat(weighted, view.first[:-1])
+        derivatives = np.add.reduceat(weighted, view.first[:-1])
         # The same step, as tables have kinks at their nodes: rounding of singles over it, and
         # of an angle from its tangent.
-        np.testing.assert_allclose(found, by_hand, atol=2e-3 * np.abs(by_hand).max())
+        np.testing.assert_allclose(derivatives, by_hand, atol=2e-3 * np.abs(by_hand).max())
 
 
 def test_the_normal_matrix_of_pixels_is_symmetric_and_positive(small_rng):
@@ -175,17 +175,17 @@ def test_texels_that_are_saturated_wherever_they_are_seen_are_not_darker_than_th
                 values[clipped] = level
             fitted.append(replace(view, values=values, at_least=clipped & as_bounds))
             limits.append(clipped)
-        found = begin
+        current = begin
         with ThreadPoolExecutor(2) as pool:
             for _ in range(3):
                 normals = truth.frames[:, 2]
-                step = image_step(fitted, found, graph_of(N_TEXELS), normals, pool)
-                found = step.model
+                step = image_step(fitted, current, graph_of(N_TEXELS), normals, pool)
+                current = step.model
         n_clipped = sum(clipped.sum() for clipped in limits)
         assert step.n_bounds == (n_clipped if as_bounds else 0)
         # About half of those that are fitted to their limit lie a little below it.
         assert step.n_unmet < 0.6 * n_clipped
-        shades = [shown(found, v)[clipped] for v, clipped in zip(views, limits, strict=True)]
+        shades = [shown(current, v)[clipped] for v, clipped in zip(views, limits, strict=True)]
         return np.maximum(1 - np.concatenate(shades) / level, 0).mean()
 
     left_out, bounded = darker_than_seen(False), darker_than_seen(True)
@@ -205,8 +205,8 @@ def test_steps_find_colours_and_normals_that_were_changed(small_rng):
     model = _changed(truth, change)
     with ThreadPoolExecutor(2) as pool:
         for _ in range(3):
-            found = image_step(views, model, graph_of(N_TEXELS), truth.frames[:, 2], pool)
-            model = found.model
+            step = image_step(views, model, graph_of(N_TEXELS), truth.frames[:, 2], pool)
+            model = step.model
 
     def error(m):
         cosine = (m.frames[:, 2] * truth.frames[:, 2]).sum(axis=1)
@@ -214,20 +214,20 @@ def test_steps_find_colours_and_normals_that_were_changed(small_rng):
 
     assert error(model) < 0.2 * error(_changed(truth, change))
     assert np.abs(model.diffuse - truth.diffuse).mean() < 0.02
-    assert (found.information > 0).all()
+    assert (step.information > 0).all()
 
 
 def test_a_step_does_not_depend_on_the_number_of_threads(small_rng):
     model = smooth_model(small_rng)
     views = [pixels_of(small_rng, model) for _ in range(3)]
     begin = replace(model, diffuse=0.8 * model.diffuse)
-    found = []
+    models = []
     for n in (1, 3):
         with ThreadPoolExecutor(n) as pool:
             step = image_step(views, begin, graph_of(N_TEXELS), model.frames[:, 2], pool)
-        found.append(step.model)
+        models.append(step.model)
     for name in ("frames", "diffuse", "weights"):
-        np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
+        np.testing.assert_array_equal(getattr(models[0], name), getattr(models[1], name))
 
 
 @pytest.mark.parametrize("level", [0.0, 1e6])
@@ -236,11 +236,11 @@ def test_black_and_glaring_pixels_leave_finite_coefficients(small_rng, level):
     view = pixels_of(small_rng, model)
     view = replace(view, values=np.full_like(view.values, level))
     with ThreadPoolExecutor(1) as pool:
-        found = image_step([view], model, graph_of(N_TEXELS), model.frames[:, 2], pool).model
+        stepped = image_step([view], model, graph_of(N_TEXELS), model.frames[:, 2], pool).model
     for name in ("frames", "diffuse", "weights"):
-        assert np.isfinite(getattr(found, name)).all()
-    assert found.diffuse.min() >= 0
-    assert found.weights.min() >= 0
+        assert np.isfinite(getattr(stepped, name)).all()
+    assert stepped.diffuse.min() >= 0
+    assert stepped.weights.min() >= 0
 
 
 def test_rows_of_pixels_show_what_the_pixels_do(small_rng):
@@ -250,8 +250,8 @@ def test_rows_of_pixels_show_what_the_pixels_do(small_rng):
     assert rows.n_rows == N_PIXELS * N_LIGHTS
     entries = np.zeros((len(rows.texel), 3), np.float32)
     evaluate_half_vector(*model.arrays, rows.texel, rows.views, rows.lights, entries)
-    found = np.add.reduceat(entries * rows.share[:, None], rows.first[:-1])
-    np.testing.assert_allclose(found, rows.values, rtol=1e-4, atol=1e-6)
+    sums = np.add.reduceat(entries * rows.share[:, None], rows.first[:-1])
+    np.testing.assert_allclose(sums, rows.values, rtol=1e-4, atol=1e-6)
 
 
 def test_frames_are_rotations(small_rng):

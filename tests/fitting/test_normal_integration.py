@@ -92,10 +92,10 @@ def test_texels_at_one_point_move_as_one():
     i, j = texel_graph(positions, up).pairs.T
     graph = TexelGraph(len(twice), np.stack([np.append(i, 100), np.append(j, SIDE**2)], axis=1))
     fitted = FittedNormals(positions, up, normals, np.ones(len(up)))
-    found = integrated_displacements(fitted, graph, np.zeros(len(up)))
-    assert np.isfinite(found).all()
-    assert abs(found[-1] - found[100]) < 0.05 * np.abs(height).max()
-    assert np.abs(found[:-1] - height).max() < 0.25 * np.abs(height).max()
+    moves = integrated_displacements(fitted, graph, np.zeros(len(up)))
+    assert np.isfinite(moves).all()
+    assert abs(moves[-1] - moves[100]) < 0.05 * np.abs(height).max()
+    assert np.abs(moves[:-1] - height).max() < 0.25 * np.abs(height).max()
 
 
 def test_texels_without_neighbours_are_refused():
@@ -114,10 +114,10 @@ def test_anchors_stand_where_an_outline_touches_a_rim():
     points = np.concatenate([pixel - 10.0, [[1.0], [1], [1]]], axis=1)
     normals = np.array([[1.0, 0, 0], [0, 0, -1], [1, 0, 0]])
     distances = [signed_distance(coverage), None]
-    found = silhouette_anchors([camera, camera], distances, points, normals)
-    assert found[0] > 0.9
-    assert found[1] < 1e-6
-    assert found[2] == 0
+    anchors = silhouette_anchors([camera, camera], distances, points, normals)
+    assert anchors[0] > 0.9
+    assert anchors[1] < 1e-6
+    assert anchors[2] == 0
 
 
 def test_confidence_without_information_is_zero():
@@ -127,5 +127,5 @@ def test_confidence_without_information_is_zero():
 def test_vertices_at_one_place_move_together(rng):
     texels, moves = rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
     vertex = rng.normal(size=(1, 3))
-    found = moved_vertices(np.repeat(vertex, 2, axis=0), texels, moves)
-    np.testing.assert_array_equal(found[0], found[1])
+    moved = moved_vertices(np.repeat(vertex, 2, axis=0), texels, moves)
+    np.testing.assert_array_equal(moved[0], moved[1])

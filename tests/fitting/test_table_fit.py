@@ -90,23 +90,23 @@ def test_planted_tables_explain_rows_after_the_fit(small_rng):
     rows = random_rows(small_rng, truth, 4000)
     begin = replace(truth, lobes=np.full_like(truth.lobes, 0.2))
     with ThreadPoolExecutor(2) as pool:
-        found = fit_tables(rows, begin, pool, smoothness=1e-7, iterations=40)
+        fit = fit_tables(rows, begin, pool, smoothness=1e-7, iterations=40)
     before = np.abs(shown(begin, rows) - rows.values).mean()
     # Nodes jump by e^3 from layer to layer, which no smoothness likes.
-    assert np.abs(shown(found, rows) - rows.values).mean() < 0.15 * before
-    assert found.lobes.min() >= 0
-    assert found.diffuse_table.min() > 0
+    assert np.abs(shown(fit, rows) - rows.values).mean() < 0.15 * before
+    assert fit.lobes.min() >= 0
+    assert fit.diffuse_table.min() > 0
 
 
 def test_tables_do_not_depend_on_the_number_of_threads(small_rng):
     model = random_model(small_rng)
     rows = random_rows(small_rng, model, 100)
     begin = replace(model, lobes=0.5 * model.lobes)
-    found = []
+    lobes = []
     for n in (1, 3):
         with ThreadPoolExecutor(n) as pool:
-            found.append(fit_tables(rows, begin, pool, iterations=3).lobes)
-    np.testing.assert_array_equal(found[0], found[1])
+            lobes.append(fit_tables(rows, begin, pool, iterations=3).lobes)
+    np.testing.assert_array_equal(lobes[0], lobes[1])
 
 
 def test_values_that_were_not_measured_do_not_count(small_rng):
@@ -116,8 +116,8 @@ def test_values_that_were_not_measured_do_not_count(small_rng):
     values[::2, 1] = np.nan
     begin = replace(model, lobes=0.5 * model.lobes)
     with ThreadPoolExecutor(1) as pool:
-        found = fit_tables(replace(rows, values=values), begin, pool, iterations=3)
-    assert np.isfinite(found.lobes).all()
+        fit = fit_tables(replace(rows, values=values), begin, pool, iterations=3)
+    assert np.isfinite(fit.lobes).all()
 
 
 def test_tables_reach_what_saturated_values_are_known_to_reach(small_rng):
@@ -136,11 +136,11 @@ def test_tables_reach_what_saturated_values_are_known_to_reach(small_rng):
     with ThreadPoolExecutor(2) as pool:
         for bounds in (False, True):
             values = np.where(clipped & bounds, level, dim)
-            found = begin
+            fit = begin
             for _ in range(3):
                 some = replace(rows, values=values, at_least=clipped & bounds)
-                found = fit_tables(some, found, pool, smoothness=1e-4)
-            darker[bounds] = np.maximum(1 - shown(found, rows)[clipped] / level, 0).mean()
+                fit = fit_tables(some, fit, pool, smoothness=1e-4)
+            darker[bounds] = np.maximum(1 - shown(fit, rows)[clipped] / level, 0).mean()
     assert darker[False] > 0.2
     assert darker[True] < 0.3 * darker[False]
 
@@ -148,11 +148,11 @@ def test_tables_reach_what_saturated_values_are_known_to_reach(small_rng):
 def test_the_normal_form_changes_no_sample(small_rng):
     model = random_model(small_rng)
     rows = random_rows(small_rng, model, 50)
-    found = normalised_tables(model)
-    assert found.diffuse_table.mean() == pytest.approx(1, rel=1e-6)
-    assert np.mean(found.weights**2, axis=0) == pytest.approx(np.ones(2), rel=1e-6)
+    normalised = normalised_tables(model)
+    assert normalised.diffuse_table.mean() == pytest.approx(1, rel=1e-6)
+    assert np.mean(normalised.weights**2, axis=0) == pytest.approx(np.ones(2), rel=1e-6)
     # Two roundings of singles more.
-    np.testing.assert_allclose(shown(found, rows), rows.values, rtol=1e-5)
+    np.testing.assert_allclose(shown(normalised, rows), rows.values, rtol=1e-5)
 
 
 def test_no_rows_leave_the_model_as_it_is(small_rng):

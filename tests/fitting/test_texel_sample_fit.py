@@ -91,21 +91,21 @@ def test_coefficients_are_never_negative(small_rng):
     block = block_of(small_rng, model)
     noise = small_rng.normal(size=block.values.shape).astype(np.float32)
     with ThreadPoolExecutor(1) as pool:
-        found, _ = solve_coefficients(
+        fit, _ = solve_coefficients(
             blocks_of(replace(block, values=block.values * 0.1 + noise)), model, pool
         )
-    assert found.diffuse.min() >= 0
-    assert found.weights.min() >= 0
-    assert (found.weights == 0).any()
+    assert fit.diffuse.min() >= 0
+    assert fit.weights.min() >= 0
+    assert (fit.weights == 0).any()
 
 
 def test_texels_without_samples_get_the_usual_coefficients(small_rng):
     model = random_model(small_rng, 5)
     block = without_samples(block_of(small_rng, model), 2)
     with ThreadPoolExecutor(1) as pool:
-        found, _ = solve_coefficients(blocks_of(block), model, pool)
+        fit, _ = solve_coefficients(blocks_of(block), model, pool)
         colored = with_start_colors(blocks_of(block), model, pool)
-    np.testing.assert_allclose(found.diffuse[2], model.diffuse.mean(axis=0), rtol=1e-3)
+    np.testing.assert_allclose(fit.diffuse[2], model.diffuse.mean(axis=0), rtol=1e-3)
     assert np.isfinite(colored.diffuse).all()
 
 
@@ -119,9 +119,9 @@ def test_rounds_explain_samples_of_a_known_material(small_rng, n_lobes):
     blocks = blocks_of(block_of(small_rng, truth))
     with ThreadPoolExecutor(2) as pool:
         model = with_start_colors(blocks, start_model(truth.frames, n_lobes), pool)
-        found, residuals = fit_to_samples(blocks, model, pool, 4, 3e-4)
+        fit, residuals = fit_to_samples(blocks, model, pool, 4, 3e-4)
     assert residuals[-1] < 0.5 * residuals[0]
-    assert found.lobes.min() >= 0
+    assert fit.lobes.min() >= 0
 
 
 def test_tangents_turn_to_the_long_axis_of_highlights(small_rng):
@@ -141,12 +141,12 @@ def test_tangents_turn_to_the_long_axis_of_highlights(small_rng):
     lobes = np.tile(round_lobe, 6)[None, :, None].repeat(3, 2).astype(np.float32)
     graph = TexelGraph(30, np.stack([np.arange(29), np.arange(1, 30)], axis=1))
     with ThreadPoolExecutor(2) as pool:
-        found = with_tangents_along_highlights(
+        turned_back = with_tangents_along_highlights(
             blocks_of(block), replace(truth, frames=turned, lobes=lobes), graph, pool
         )
-    off = np.degrees(np.arccos(np.clip(np.abs(found.frames[:, 0, 0]), 0, 1)))
+    off = np.degrees(np.arccos(np.clip(np.abs(turned_back.frames[:, 0, 0]), 0, 1)))
     assert np.median(off) < 5
-    np.testing.assert_allclose(found.frames[:, 2], turned[:, 2], atol=1e-6)
+    np.testing.assert_allclose(turned_back.frames[:, 2], turned[:, 2], atol=1e-6)
 
 
 def test_blocks_beyond_the_budget_are_read_again(small_rng):

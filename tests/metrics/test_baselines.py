@@ -65,12 +65,12 @@ def test_a_baseline_is_measured_as_the_field_is(matt):
     scores = BaselineScores(exposure=2.0)
     black = np.zeros_like(truth.image)
     scores.add(pair, BLACK, black)
-    found = scores.to_dict({NEAREST: "no photographs", MEAN: "none"})
+    document = scores.to_dict({NEAREST: "no photographs", MEAN: "none"})
     expected = measure_image(ImagePair("a", truth.image, black, truth.coverage), 2.0)
-    assert found[BLACK]["frames"] == [expected.to_dict()]
-    assert found[BLACK]["mean"]["psnr_ldr"] == expected.psnr_ldr
-    assert found["missing"] == {NEAREST: "no photographs", MEAN: "none"}
-    assert NEAREST not in found
+    assert document[BLACK]["frames"] == [expected.to_dict()]
+    assert document[BLACK]["mean"]["psnr_ldr"] == expected.psnr_ldr
+    assert document["missing"] == {NEAREST: "no photographs", MEAN: "none"}
+    assert NEAREST not in document
 
 
 def test_the_albedo_of_means_is_bounded_where_lights_graze():

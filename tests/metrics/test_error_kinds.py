@@ -113,10 +113,10 @@ def test_a_step_of_albedo_is_a_texture_edge(floor):
     kinds = kinds_of(floor, Light("l", "unknown"), silhouette=whole(), albedo=albedo)
     x = np.arange(SIZE) + 0.5
     # The two texels beside the step, 1.6 pixels each, blend over one.
-    found = np.flatnonzero(kinds[SIZE // 2] == TEXTURE_EDGE)
-    assert len(found)
-    assert np.abs(x[found] - column(-0.5)).max() < 3
-    assert (kinds[30:90, found] == TEXTURE_EDGE).all()
+    columns = np.flatnonzero(kinds[SIZE // 2] == TEXTURE_EDGE)
+    assert len(columns)
+    assert np.abs(x[columns] - column(-0.5)).max() < 3
+    assert (kinds[30:90, columns] == TEXTURE_EDGE).all()
     # A tenth more is no edge.
     faint = np.where(table[:, :1] < -0.5, 0.8, 0.88) * np.ones(3)
     kinds = kinds_of(floor, Light("l", "unknown"), silhouette=whole(), albedo=faint)

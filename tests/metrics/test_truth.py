@@ -32,20 +32,20 @@ def sphere(radius, centre=(0, 0, 0), subdivisions=4):
 
 def test_concentric_spheres_are_their_radii_apart():
     # Facets of the finer sphere lie up to r (1 - cos(edge / 2)), 0.05 % of r, below it.
-    found = hull_distance(sphere(0.11), sphere(0.10), voxel=0.002).summary()
-    assert found["mean_mm"] == pytest.approx(10, abs=0.1)
-    assert found["mean_voxels"] == pytest.approx(5, abs=0.05)
-    assert found["outside_share"] == 1
+    summary = hull_distance(sphere(0.11), sphere(0.10), voxel=0.002).summary()
+    assert summary["mean_mm"] == pytest.approx(10, abs=0.1)
+    assert summary["mean_voxels"] == pytest.approx(5, abs=0.05)
+    assert summary["outside_share"] == 1
     inner = hull_distance(sphere(0.09), sphere(0.10))
     assert inner.outside == 0
     assert inner.signed.mean() == pytest.approx(-0.01, abs=1e-4)
 
 
 def test_half_of_a_shifted_sphere_is_outside():
-    found = hull_distance(sphere(1, centre=(0.02, 0, 0)), sphere(1))
+    distance = hull_distance(sphere(1, centre=(0.02, 0, 0)), sphere(1))
     # Signed distance is the shift times the cosine: uniform in +-0.02, mean size 0.01.
-    assert np.abs(found.signed).mean() == pytest.approx(0.01, abs=4e-4)
-    assert found.outside == pytest.approx(0.5, abs=0.03)
+    assert np.abs(distance.signed).mean() == pytest.approx(0.01, abs=4e-4)
+    assert distance.outside == pytest.approx(0.5, abs=0.03)
 
 
 @pytest.mark.reference
@@ -53,17 +53,17 @@ def test_distances_are_those_of_trimesh_far_from_the_origin(rng):
     truth = trimesh.creation.annulus(0.3, 0.5, 0.4)
     hull = trimesh.creation.cylinder(0.52, 0.44)
     away = np.array([40.0, -7.0, 13.0])
-    found = hull_distance(
+    distance = hull_distance(
         (hull.vertices + away, hull.faces), (truth.vertices + away, truth.faces), n_samples=500
     )
     expected = hull_distance(
         (hull.vertices, hull.faces), (truth.vertices, truth.faces), n_samples=500
     )
-    assert np.allclose(found.signed, expected.signed, atol=1e-6)  # float32 of a size 1 mesh
+    assert np.allclose(distance.signed, expected.signed, atol=1e-6)  # float32 of a size 1 mesh
     # The cap over the bore is nearest to the bore's rim, by hand:
     # its middle lies hypot(0.3, 0.02) away (half heights 0.22 and 0.20).
-    assert found.signed.max() == pytest.approx(math.hypot(0.3, 0.02), rel=0.1)
-    assert found.outside == 1
+    assert distance.signed.max() == pytest.approx(math.hypot(0.3, 0.02), rel=0.1)
+    assert distance.outside == 1
 
 
 def test_shares_of_either_side_are_those_of_the_areas():
@@ -71,12 +71,12 @@ def test_shares_of_either_side_are_those_of_the_areas():
     axes = np.array([1.0, 0.5, 0.7])
     truth = trimesh.creation.icosphere(subdivisions=4)
     hull = trimesh.creation.box([1.6, 0.7, 1.0])
-    found = hull_distance((hull.vertices, hull.faces), (truth.vertices * axes, truth.faces))
+    distance = hull_distance((hull.vertices, hull.faces), (truth.vertices * axes, truth.faces))
     points, _ = trimesh.sample.sample_surface(hull, 20_000, seed=1)
     inside = ((points / axes) ** 2).sum(axis=1) < 1
     assert 0.1 < inside.mean() < 0.9
     # Binomial deviation of 20,000 free draws is 0.0035.
-    assert 1 - found.outside == pytest.approx(inside.mean(), abs=0.015)
+    assert 1 - distance.outside == pytest.approx(inside.mean(), abs=0.015)
 
 
 def test_hull_without_faces_or_area_is_refused():
@@ -176,8 +176,8 @@ def test_one_turn_is_removed_for_each_target_and_material(rng):
     points = SurfacePoints(position, frames[:, 2], frames[:, 0], label)
     planted = np.array([[-80.0, 30.0], [0.0, 89.0], [45.0, -45.0]])
     noise = rng.normal(0, 4.0, n) + 180.0 * rng.integers(0, 2, n)
-    found = turned_about_normals(frames, planted[target, label] + noise)
-    errors = frame_errors(position, found, points, 1e-9, target)
+    recovered = turned_about_normals(frames, planted[target, label] + noise)
+    errors = frame_errors(position, recovered, points, 1e-9, target)
     assert {(t.target, t.label) for t in errors.rotations} == set(np.ndindex(3, 2))
     for turn in errors.rotations:
         # The mean of about 500 turns of 4 degrees: 0.18; five times that.
@@ -189,7 +189,7 @@ def test_one_turn_is_removed_for_each_target_and_material(rng):
     # Where no neighbour of the material lies near, the true frame is the point's own.
     assert np.median(errors.normal) < 1e-6
     # Without targets nothing is removed.
-    assert frame_errors(position, found, points, 1e-9).tangent.mean() > 30
+    assert frame_errors(position, recovered, points, 1e-9).tangent.mean() > 30
 
 
 def test_tilt_does_not_bias_the_turn(rng):
@@ -211,8 +211,8 @@ def test_random_tangents_stay_random(rng):
     frames = Rotation.random(n, random_state=rng).as_matrix()
     position = rng.normal(size=(n, 3))
     points = SurfacePoints(position, frames[:, 2], frames[:, 0], np.zeros(n, int))
-    found = turned_about_normals(frames, rng.uniform(0, 180, n))
-    errors = frame_errors(position, found, points, 1e-9, np.zeros(n, int))
+    recovered = turned_about_normals(frames, rng.uniform(0, 180, n))
+    errors = frame_errors(position, recovered, points, 1e-9, np.zeros(n, int))
     # Uniform from 0 to 90: mean 45, its scatter .37; the turn removed gains as much.
     assert errors.tangent.mean() == pytest.approx(45.0, abs=1.5)
 

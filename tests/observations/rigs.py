@@ -152,3 +152,13 @@ def smoothness_precision(side, smoothness):
                     edge[a], edge[b] = 1, -1
                     precision += np.outer(edge, edge)
     return smoothness * precision
+
+
+def directions_at(*heights):
+    """Unit directions (1, k, 3) of given z."""
+    z = np.array(heights)
+    return np.stack([np.sqrt(1 - z * z), 0 * z, z], axis=1)[None].astype(np.float32)
+
+
+def identity(n):
+    return np.tile(np.eye(3, dtype=np.float32), (n, 1, 1))

@@ -116,8 +116,8 @@ def test_what_is_clipped_everywhere_is_continued_and_counts_a_little(rng):
     under_first_lights = whole.pairs.light < 3
     samples[:, under_first_lights, 1], samples[1, ..., 2] = np.nan, np.nan
     frames = np.tile(np.eye(3, dtype=np.float32), (2, 1, 1))
-    found = transformed_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
-    nodes = resample(found, (1, 5), 0.03)
+    clipped = transformed_samples(replace(whole, samples=samples), frames, (1, 5), "linear")
+    nodes = resample(clipped, (1, 5), 0.03)
     weights = nodes.weights[:, 0]
     zenith = 12  # of 5 x 5, amid the first lights
     assert weights[0, zenith, 1] == np.float32(CONTINUED)
@@ -135,13 +135,13 @@ def test_values_not_measured_against_a_weighted_solve(rng, monkeypatch, rounding
     values = np.where(measured, whole.values, np.float32(77))
     gaps = replace(whole, values=values, channels=measured @ CHANNEL_BITS)
     monkeypatch.setattr(frame_resampling, "FILLING_SWEEPS", 300)
-    found = resample(gaps, (5, 5), 0.3)
+    nodes = resample(gaps, (5, 5), 0.3)
     for t in range(2):
         for c in range(3):
             pairs = measured[t, ..., c].astype(np.float32)
             of_channel = replace(whole, pairs=pairs)
             expected = weighted_solution(of_channel, (5, 5), 0.3, t)[..., c]
-            error = np.abs(found.values[t, ..., c] - expected).max()
+            error = np.abs(nodes.values[t, ..., c] - expected).max()
             assert error < rounding(np.float32, **SOLVE, scale=3)
 
 
@@ -187,7 +187,7 @@ def test_samples_of_which_nothing_was_measured_are_counted(reader_of):
     values[2, 6:12] = np.nan
     changed = create_samples(reader.store.location, N, reader.store.observed.pairs)
     changed[:] = values
-    found = reader.count_fitted(np.arange(N))
+    counts = reader.count_fitted(np.arange(N))
     n_counted = int((reader.transformed(np.array([2])).light_weights > 0).sum())
-    assert found.unmeasured == n_counted
-    assert found.fitted == usual.fitted - n_counted
+    assert counts.unmeasured == n_counted
+    assert counts.fitted == usual.fitted - n_counted

@@ -21,8 +21,8 @@ def as_they_are(vector, camera, is_position):
 
 
 def directions(rng, n):
-    found = rng.normal(size=(n, 3))
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    vectors = rng.normal(size=(n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def photographed(rng, described, kind="point", n_looks=12):

@@ -86,8 +86,8 @@ def angles(frames, truth):
 
 def test_planted_frames_come_back(planted, model):
     reader, truth = planted
-    found = refined_frames(reader, model, np.arange(N), SPREAD)
-    before, after = angles(reader.local_from_world, truth), angles(found, truth)
+    refined = refined_frames(reader, model, np.arange(N), SPREAD)
+    before, after = angles(reader.local_from_world, truth), angles(refined, truth)
     # Half floats, a bilinear target and three steps leave a few hundredths.
     assert before.mean() > 2.5
     assert np.median(after) < 0.02 * np.median(before)
@@ -102,9 +102,9 @@ def test_values_not_measured_are_excluded(planted, model, rng):
     values[rng.random(values.shape) < 0.5] = np.nan
     stored[:] = values
     before = angles(reader.local_from_world, truth)
-    found = refined_frames(reader, model, np.arange(N), SPREAD)
+    refined = refined_frames(reader, model, np.arange(N), SPREAD)
     # Less near than with all of them; were NaN a value, none would come back at all.
-    assert np.median(angles(found, truth)) < 0.06 * np.median(before)
+    assert np.median(angles(refined, truth)) < 0.06 * np.median(before)
 
 
 def test_a_spread_of_nothing_keeps_the_frames(planted, model):
@@ -127,9 +127,9 @@ def test_texels_without_samples_keep_their_frames(planted, model):
     reader, _ = planted
     reader.store.observed.views[5] = False
     reader.store.observed.lights[8] = False
-    found = refined_frames(reader, model, np.arange(N), SPREAD)
-    assert np.isfinite(found).all()
-    np.testing.assert_allclose(found[[5, 8]], reader.local_from_world[[5, 8]], atol=1e-6)
+    refined = refined_frames(reader, model, np.arange(N), SPREAD)
+    assert np.isfinite(refined).all()
+    np.testing.assert_allclose(refined[[5, 8]], reader.local_from_world[[5, 8]], atol=1e-6)
 
 
 def test_normal_equations_are_the_slopes_of_the_squares(model, rng):

@@ -260,7 +260,7 @@ class TestClipping:
     """Photographs of eight bits, one exposure, as a camera writes them."""
 
     @pytest.fixture
-    def found(self, tmp_path):
+    def measure(self, tmp_path):
         """Return a function from codes (h, w, 3) to samples at pixel centres, and counts."""
 
         def run(codes, offset=0.0):
@@ -280,10 +280,10 @@ class TestClipping:
 
         return run
 
-    def test_saturated_values_are_not_measured(self, found):
+    def test_saturated_values_are_not_measured(self, measure):
         codes = np.full((HEIGHT, WIDTH, 3), 100)
         codes[2, 3] = [255, 200, 255]
-        values, projected, stored = found(codes)
+        values, projected, stored = measure(codes)
         expected = np.zeros(values.shape, bool)
         expected[2, 3] = [True, False, True]
         assert np.array_equal(np.isnan(values), expected)
@@ -292,18 +292,18 @@ class TestClipping:
         assert stored.gaps == 2 / values.size
         assert projected.measured.all()  # the green of that pixel
 
-    def test_beside_a_saturated_pixel_nothing_is_measured(self, found):
+    def test_beside_a_saturated_pixel_nothing_is_measured(self, measure):
         codes = np.full((HEIGHT, WIDTH, 3), 100)
         codes[2, 3] = 255
-        values, projected, _ = found(codes, offset=0.25)
+        values, projected, _ = measure(codes, offset=0.25)
         # A quarter of the way from pixel 3 to 4, and three quarters from 2 to 3.
         assert np.argwhere(np.isnan(values[..., 0])).tolist() == [[2, 2], [2, 3]]
         assert projected.count("saturated") == 6
 
-    def test_code_zero_is_the_bounded_measurement_that_it_is(self, found):
+    def test_code_zero_is_the_bounded_measurement_that_it_is(self, measure):
         codes = np.full((HEIGHT, WIDTH, 3), 100)
         codes[1, 1], codes[4, 4] = 1, 0
-        values, projected, stored = found(codes)
+        values, projected, stored = measure(codes)
         # Of numbers spread evenly below half a code the mean cube root is three quarters of
         # the largest; halves round to 2^-25 of the unit.
         least = 1 / 255 / 12.92
@@ -312,10 +312,10 @@ class TestClipping:
         assert projected.count("black") == 3
         assert stored.gaps == 0
 
-    def test_texel_of_which_nothing_was_measured_is_told(self, found):
+    def test_texel_of_which_nothing_was_measured_is_told(self, measure):
         codes = np.full((HEIGHT, WIDTH, 3), 100)
         codes[5, 6] = 255
-        _, projected, _ = found(codes)
+        _, projected, _ = measure(codes)
         assert np.flatnonzero(~projected.measured[:, 0]).tolist() == [5 * WIDTH + 6]
 
 
@@ -362,7 +362,7 @@ def test_the_photographs_looked_into_show_every_light(capture_of, tmp_path):
     capture = capture_of(np.ones((10, 6, HEIGHT, WIDTH, 3)), [lamp(f"l{i}") for i in range(6)])
     points = np.zeros((1, 3))
     seen = np.ones((1, 10), np.bool_)
-    found = look_into(Projection(capture, points, seen, tmp_path / "none"))
-    shown = [capture.photographs[i] for i in found.photograph]
+    look = look_into(Projection(capture, points, seen, tmp_path / "none"))
+    shown = [capture.photographs[i] for i in look.photograph]
     assert {p.light for p in shown} == set(range(6))
     assert len({p.camera for p in shown}) >= 6

@@ -120,10 +120,10 @@ class TestReader:
         reader = reader_of(capture, np.maximum(samples, 0), sides=(1, 3))
         reader = reader.rotated(flat.local_from_world)
         object.__setattr__(reader, "positions", flat.positions)
-        found = reader.nodes(np.arange(10))
-        seen = found.light_support > 0.9
+        grid = reader.nodes(np.arange(10))
+        seen = grid.light_support > 0.9
         # Halves, the smoothness demanded (0.03 against some ten samples a node).
-        assert np.abs(found.values[:, 0, :, 0] - slope)[seen].max() < 0.05
+        assert np.abs(grid.values[:, 0, :, 0] - slope)[seen].max() < 0.05
         turned = reader.rotated(np.roll(flat.local_from_world, 1, axis=1))
         # The normal is now another axis: the function is not found.
         other = turned.nodes(np.arange(10))
@@ -184,7 +184,7 @@ class TestLuminance:
 
     def test_directions_are_those_to_cameras_and_lights_in_the_frame(self, reader):
         texels = np.array([31, 4])
-        found = reader.luminance(texels)
+        luminance = reader.luminance(texels)
         for i, t in enumerate(texels):
             towards = np.stack([light.position for light in reader.capture.lights])
             towards = towards - reader.positions[t]
@@ -192,22 +192,22 @@ class TestLuminance:
             expected = towards @ reader.local_from_world[t].T.astype(float)
             # Directions of the world are handed on as float32.
             eps = np.finfo(np.float32).eps
-            np.testing.assert_allclose(found.lights[i], expected, atol=4 * eps)
-        assert found.views.shape == (2, 6, 3)
+            np.testing.assert_allclose(luminance.lights[i], expected, atol=4 * eps)
+        assert luminance.views.shape == (2, 6, 3)
 
     def test_directions_that_do_not_vary_become_one(self, reader_of, rng):
         unknown = tuple(Light(f"l{i}", "unknown") for i in range(3))
         samples = rng.random((4, 1, 3, 3))
         lights = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 0]], bool)
         reader = reader_of(dome(1, 3, lights=unknown), samples, sides=(1, 1), lights=lights)
-        found = reader.luminance(np.arange(4))
-        assert found.samples.shape == (4, 1, 1)
+        luminance = reader.luminance(np.arange(4))
+        assert luminance.samples.shape == (4, 1, 1)
         value = samples.astype(np.float16).astype(float) @ [0.2126, 0.7152, 0.0722]
-        assert np.isnan(found.samples[2, 0, 0])
+        assert np.isnan(luminance.samples[2, 0, 0])
         np.testing.assert_allclose(
-            found.samples[1, 0, 0], value[1, 0, [0, 2]].mean(), rtol=1e-6
+            luminance.samples[1, 0, 0], value[1, 0, [0, 2]].mean(), rtol=1e-6
         )
-        np.testing.assert_array_equal(found.lights, np.tile([0.0, 0, 1], (4, 1, 1)))
+        np.testing.assert_array_equal(luminance.lights, np.tile([0.0, 0, 1], (4, 1, 1)))
 
 
 class TestShade:

@@ -62,9 +62,9 @@ HALF = 2.0**-11
 
 
 def test_samples_of_the_field_itself_have_no_error(field, reader_of):
-    found = sample_error(field, reader_of(1.0), np.arange(field.n_texels))
-    assert found.linear < HALF
-    assert found.cube_root < HALF
+    error = sample_error(field, reader_of(1.0), np.arange(field.n_texels))
+    assert error.linear < HALF
+    assert error.cube_root < HALF
 
 
 def test_values_not_measured_do_not_count(field, reader_of, rng):
@@ -82,16 +82,16 @@ def test_values_not_measured_do_not_count(field, reader_of, rng):
 
 def test_error_is_relative_to_the_samples(field, reader_of):
     reader = reader_of(2.0)
-    found = sample_error(field, reader, np.arange(field.n_texels))
-    assert found.linear == pytest.approx(0.5, abs=2 * HALF)
-    assert found.cube_root == pytest.approx(1 - 0.5 ** (1 / 3), abs=2 * HALF)
-    assert found.n_samples == reader.store.observed.count()
+    error = sample_error(field, reader, np.arange(field.n_texels))
+    assert error.linear == pytest.approx(0.5, abs=2 * HALF)
+    assert error.cube_root == pytest.approx(1 - 0.5 ** (1 / 3), abs=2 * HALF)
+    assert error.n_samples == reader.store.observed.count()
 
 
 def test_psnr_is_that_of_the_radiances_as_they_are_shown(field, reader_of):
     """Sample by sample, against the functions that photographs are compared with."""
     reader = reader_of(1.5)
-    found = sample_error(field, reader, np.arange(field.n_texels))
+    error = sample_error(field, reader, np.arange(field.n_texels))
     seen = reader.store.observed
     t, i, j = np.nonzero(seen.views[:, :, None] & seen.lights[:, None] & seen.pairs.table)
     views, lights = directions_of(reader.capture, reader.positions)
@@ -104,15 +104,15 @@ def test_psnr_is_that_of_the_radiances_as_they_are_shown(field, reader_of):
     shown = [encode_srgb(np.clip(exposure * x, 0, 1)) for x in (measured, relit)]
     expected = -10 * np.log10(np.mean((shown[0] - shown[1]) ** 2))
     # Halves err by up to 2^-11 of a sample, a hundredth of the error that is measured.
-    assert found.psnr_ldr == pytest.approx(expected, abs=0.05)
+    assert error.psnr_ldr == pytest.approx(expected, abs=0.05)
 
 
 def test_texels_are_thinned_to_the_samples_asked_for(field, reader_of):
     reader = reader_of(2.0)
     each = reader.store.observed.count() / field.n_texels
-    found = sample_error(field, reader, np.arange(field.n_texels), int(4.5 * each))
-    assert found.n_texels == 4
-    assert found.linear == pytest.approx(0.5, abs=2 * HALF)
+    error = sample_error(field, reader, np.arange(field.n_texels), int(4.5 * each))
+    assert error.n_texels == 4
+    assert error.linear == pytest.approx(0.5, abs=2 * HALF)
 
 
 def test_no_texel_is_refused(field, reader_of):

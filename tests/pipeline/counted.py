@@ -44,10 +44,10 @@ class Counted:
         (self.notes / f"{name}.begun").touch()
         self._die_if_it_is_time()
         time.sleep(SECONDS / 2)
-        found = self.function(context, inner)
+        result = self.function(context, inner)
         time.sleep(SECONDS / 2)
         (self.notes / f"{name}.ended").touch()
-        return found
+        return result
 
     def _die_if_it_is_time(self) -> None:
         request = self.notes / "die"

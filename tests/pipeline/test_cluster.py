@@ -36,9 +36,9 @@ def test_a_lost_worker_costs_its_blocks(tmp_path, cluster):
 
     tally = Tally()
     blocks = Blocks(Scheduler(1, cluster), tmp_path / "blocks", tally)
-    found = blocks.map("processes", process_of, str(tmp_path), range(12))
-    assert [int(arrays["square"]) for arrays in found] == [n**2 for n in range(12)]
-    assert os.getpid() not in {int(arrays["process"]) for arrays in found}
+    results = blocks.map("processes", process_of, str(tmp_path), range(12))
+    assert [int(arrays["square"]) for arrays in results] == [n**2 for n in range(12)]
+    assert os.getpid() not in {int(arrays["process"]) for arrays in results}
     assert tally.computed == 12
     # Begun twice: blocks of the worker that was lost, and no other.
     lost = (tmp_path / "killed").read_text()
@@ -127,8 +127,8 @@ def test_no_worker_left(tmp_path, processes, monkeypatch):
     tally, started = Tally(), []
     blocks = Blocks(Scheduler(1, cluster.address), tmp_path / "blocks", tally)
     with listening(start_worker):
-        found = blocks.map("work", dies, str(tmp_path), range(8))
-    assert [int(arrays["block"]) for arrays in found] == list(range(8))
+        results = blocks.map("work", dies, str(tmp_path), range(8))
+    assert [int(arrays["block"]) for arrays in results] == list(range(8))
     assert tally == Tally(computed=8 - len(kept), resumed=len(kept))
     assert len(kept) >= 5 - BLOCKS_PER_THREAD
 
@@ -200,8 +200,8 @@ def test_no_worker_computes_more_at_once_than_allowed_and_each_counts_its_own_th
         folder = tmp_path / str(at_once)
         folder.mkdir()
         blocks = Blocks(Scheduler(1, running.address), tmp_path / f"{at_once}.blocks")
-        found = blocks.map("blocks", wait, str(folder), range(9), at_once=at_once)
-        most[at_once] = max(int(arrays["working"]) for arrays in found)
-        assert {int(arrays["threads"]) for arrays in found} == {3}
+        results = blocks.map("blocks", wait, str(folder), range(9), at_once=at_once)
+        most[at_once] = max(int(arrays["working"]) for arrays in results)
+        assert {int(arrays["threads"]) for arrays in results} == {3}
     assert most == {None: 3, 2: 2, 1: 1}
     assert threads_here(64) == 64

@@ -48,7 +48,7 @@ def amphora(tmp_path_factory):
 def test_light_that_the_object_sends_to_itself_is_found(
     amphora, tmp_path, reflfield, tiny_options
 ):
-    found = {}
+    psnr = {}
     for enabled in ("true", "false"):
         out = tmp_path / enabled
         outcome = reflfield(
@@ -75,10 +75,10 @@ def test_light_that_the_object_sends_to_itself_is_found(
         )
         assert outcome.status == 0, outcome.err
         unseen = json.loads((out / "stages/comparison/field/truth.json").read_text())
-        found[enabled] = unseen["mean"]["psnr_ldr"]
+        psnr[enabled] = unseen["mean"]["psnr_ldr"]
         assert open_field(out / "field.rfld").indirect.is_black == (enabled == "false")
     # So coarse a field has larger errors; .39 dB when this was written.
-    assert found["true"] > found["false"] + 0.2
+    assert psnr["true"] > psnr["false"] + 0.2
     record = json.loads((tmp_path / "true/stages/indirect/stage.json").read_text())
     stored = np.load(tmp_path / "true/stages/visibility/visibility.npz")
     in_shadow = stored["views"].sum(axis=1) @ (~stored["lights"]).sum(axis=1)

@@ -76,13 +76,13 @@ def keys(folder, options=OPTIONS, hold_out=None, **resources):
 
 @pytest.fixture(scope="module")
 def usual(capture_folder):
-    found = keys(capture_folder)
-    assert set(found) == {"silhouettes", "hull", *AFTER_HULL}
-    return found
+    usual_keys = keys(capture_folder)
+    assert set(usual_keys) == {"silhouettes", "hull", *AFTER_HULL}
+    return usual_keys
 
 
-def changed(usual, found):
-    return {name for name in usual if usual[name] != found.get(name)}
+def changed(usual, others):
+    return {name for name in usual if usual[name] != others.get(name)}
 
 
 # --- inputs -------------------------------------------------------------------------------
@@ -165,8 +165,8 @@ def test_inputs(capture_folder, usual, tmp_path, change, expected):
 
 
 def test_what_is_held_out(capture_folder, usual):
-    found = keys(capture_folder, hold_out=HoldOut(lights=1))
-    assert {"observations", *FIELD, *LATER} <= changed(usual, found)
+    without = keys(capture_folder, hold_out=HoldOut(lights=1))
+    assert {"observations", *FIELD, *LATER} <= changed(usual, without)
 
 
 # --- options ------------------------------------------------------------------------------

@@ -39,8 +39,8 @@ class CountedRun:
         self.out, self.notes = folder / "run", folder / "notes"
         self.words = ("run", capture, "-o", self.out, "--config", options)
         self.words += ("--hold-out", "views=1,lights=1", "--set", "compression.fit=samples")
-        found = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
-        self.environment = {**os.environ, "PYTHONPATH": found}
+        search_path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+        self.environment = {**os.environ, "PYTHONPATH": search_path}
 
     def start(self, *words, until="compression"):
         """Start the command; its process."""
@@ -75,10 +75,10 @@ class CountedRun:
 
     def repeated(self):
         """Times that blocks were begun again, by work."""
-        found = {
+        counts = {
             work: sum(n - 1 for n in of.values()) for work, of in self.executions().items()
         }
-        return {work: times for work, times in found.items() if times}
+        return {work: times for work, times in counts.items() if times}
 
     def begun_by(self, processes):
         """Blocks that some processes began, as (work, number)."""

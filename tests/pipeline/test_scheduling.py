@@ -35,8 +35,8 @@ class TestBlocks:
     @pytest.mark.parametrize("workers", [1, 3])
     def test_results_come_in_the_order_of_the_blocks(self, tmp_path, workers):
         blocks = Blocks(Scheduler(workers), tmp_path)
-        found = blocks.map("squares", square, 2, [5, 3, 4, 1])
-        assert [int(arrays["square"]) for arrays in found] == [50, 18, 32, 2]
+        results = blocks.map("squares", square, 2, [5, 3, 4, 1])
+        assert [int(arrays["square"]) for arrays in results] == [50, 18, 32, 2]
         assert blocks.tally == Tally(computed=4)
 
     def test_what_is_there_is_not_computed_again(self, tmp_path):
@@ -46,10 +46,10 @@ class TestBlocks:
             blocks.map("squares", first, 2, list(range(6)))
         finished = set(first.seen) - {3}
         again, tally = Fails(at=None), Tally()
-        found = Blocks(Scheduler(2), tmp_path, tally).map("squares", again, 2, list(range(6)))
+        results = Blocks(Scheduler(2), tmp_path, tally).map("squares", again, 2, list(range(6)))
         assert sorted(again.seen) == sorted(set(range(6)) - finished)
         assert tally == Tally(computed=6 - len(finished), resumed=len(finished))
-        assert [int(arrays["square"]) for arrays in found] == [2 * n * n for n in range(6)]
+        assert [int(arrays["square"]) for arrays in results] == [2 * n * n for n in range(6)]
 
     @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
     def test_damaged_results_are_computed_again(self, tmp_path, damage):
@@ -60,9 +60,9 @@ class TestBlocks:
         changed = data[:-50] + bytes([data[-50] ^ 1]) + data[-49:]
         path.write_bytes({"cut": data[:-9], "changed": changed, "empty": b""}[damage])
         again = Fails(at=None)
-        found = blocks.map("squares", again, 2, [1, 2, 3])
+        results = blocks.map("squares", again, 2, [1, 2, 3])
         assert again.seen == [2]
-        assert int(found[1]["square"]) == 8
+        assert int(results[1]["square"]) == 8
 
     def test_results_whose_other_traces_are_gone_are_computed_again(self, tmp_path):
         blocks = Blocks(Scheduler(2), tmp_path)
@@ -93,9 +93,9 @@ class TestBlocks:
             working.remove(block)
             return {"thread": np.array(threading.get_ident())}
 
-        found = Blocks(Scheduler(3), tmp_path).map("free", wait, None, range(6))
+        results = Blocks(Scheduler(3), tmp_path).map("free", wait, None, range(6))
         assert max(most) > 1
-        assert len({int(arrays["thread"]) for arrays in found}) == 3
+        assert len({int(arrays["thread"]) for arrays in results}) == 3
         most.clear()
         Blocks(Scheduler(3), tmp_path).map("one", wait, None, range(3), at_once=1)
         assert max(most) == 1
@@ -136,10 +136,10 @@ class TestBlocks:
         assert len(failing.seen) < 1000
 
     def test_a_result_that_vanishes_is_named(self, tmp_path):
-        found = Blocks(Scheduler(), tmp_path).map("squares", square, 1, [1, 2])
+        results = Blocks(Scheduler(), tmp_path).map("squares", square, 1, [1, 2])
         BlockFiles(tmp_path / "squares").path(1).unlink()
         with pytest.raises(InputError, match=r"000001.block: expected the block"):
-            found.joined("square")
+            results.joined("square")
 
 
 def blas_threads():

@@ -3,9 +3,8 @@
 import subprocess
 import sys
 
-SLOW = ("dask", "distributed", "matplotlib", "open3d", "pandas", "skimage", "sklearn",
-        "trimesh", "zarr")  # fmt: skip
-
+SLOW = ("dask", "distributed", "matplotlib", "open3d", "open3d.cpu.pybind", "pandas",
+        "scipy.linalg", "skimage", "sklearn", "trimesh", "zarr")  # fmt: skip
 
 RENDERING = "reflfield.field.file, reflfield.render.renderer, reflfield.render.turntable"
 

@@ -67,9 +67,9 @@ def nearest(sphere, capture):
 def test_the_least_sum_of_squared_angles_decides(nearest, view, light, name, angles):
     carried = nearest.carried(camera(view), DirectionalLight(around(light, 20)))
     assert carried.name == name
-    found = np.degrees([carried.view_angle, carried.light_angle])
+    angle_pair = np.degrees([carried.view_angle, carried.light_angle])
     # Lights at 20 degrees of elevation: the arc between them, by the haversine formula.
-    assert found == pytest.approx(angles, abs=0.02)
+    assert angle_pair == pytest.approx(angles, abs=0.02)
 
 
 def test_samples_are_those_of_the_nearest_over_its_light(nearest, sphere):

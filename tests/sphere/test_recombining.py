@@ -17,9 +17,9 @@ def test_products_are_those_of_scipy(n, dtype, rng, rounding):
     products = recombination(matrix, parts, dtype)(vectors)
     assert [part.shape for part in products] == [(n, size) for size in parts]
     expected = (matrix @ vectors.T.astype(np.float64)).T
-    found = np.concatenate(products, axis=1)
-    np.testing.assert_allclose(found, expected, atol=rounding(dtype, n_columns))
-    assert found.dtype == dtype
+    product = np.concatenate(products, axis=1)
+    np.testing.assert_allclose(product, expected, atol=rounding(dtype, n_columns))
+    assert product.dtype == dtype
     assert all(part.flags.c_contiguous for part in products)
 
 
@@ -30,5 +30,5 @@ def test_rows_without_entries_give_zeros():
 
 def test_vectors_need_not_be_contiguous(rng):
     vectors = rng.standard_normal((6, 5)).T
-    found = recombination(csr_array(np.eye(6)), [6], "float64")(vectors)[0]
-    np.testing.assert_array_equal(found, vectors)
+    product = recombination(csr_array(np.eye(6)), [6], "float64")(vectors)[0]
+    np.testing.assert_array_equal(product, vectors)

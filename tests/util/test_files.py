@@ -40,9 +40,9 @@ def test_large_file_is_refused_unread(tmp_path):
 def test_arrays_come_back(tmp_path):
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False])}
     np.savez_compressed(tmp_path / "x.npz", **arrays)
-    found = load_arrays(tmp_path / "x.npz", MOST)
-    assert set(found) == {"a", "b"}
-    assert all(np.array_equal(found[name], arrays[name]) for name in arrays)
+    loaded = load_arrays(tmp_path / "x.npz", MOST)
+    assert set(loaded) == {"a", "b"}
+    assert all(np.array_equal(loaded[name], arrays[name]) for name in arrays)
 
 
 def test_pickled_arrays_are_refused(tmp_path):
@@ -83,10 +83,10 @@ def test_damaged_arrays_are_one_error(tmp_path, rng):
 def says_or_reads(path):
     """Whether an error names the file; a flipped date of a member changes nothing."""
     try:
-        found = load_arrays(path, MOST)
+        loaded = load_arrays(path, MOST)
     except InputError as error:
         return path.name in str(error)
-    return all(array.shape == (50,) for array in found.values())
+    return all(array.shape == (50,) for array in loaded.values())
 
 
 def test_failed_write_leaves_the_earlier_file(tmp_path):

@@ -244,12 +244,12 @@ def test_a_link_restores_the_view(page, open_page, html):
     page.locator("#link").click()
     settled(page)
     wanted, fragment = scene(page), page.url.partition("#")[2]
-    found = scene(open_page(html, fragment))
+    restored = scene(open_page(html, fragment))
     for name in ("azimuth", "elevation", "distance", "target"):
-        assert found["camera"][name] == pytest.approx(wanted["camera"][name], rel=1e-4)
+        assert restored["camera"][name] == pytest.approx(wanted["camera"][name], rel=1e-4)
     for name in ("flash", "exposure", "curve", "show", "backdrop", "photo", "map"):
-        assert found[name] == wanted[name]
-    assert [lamp["on"] for lamp in found["lamps"]] == [True, False, True]
+        assert restored[name] == wanted[name]
+    assert [lamp["on"] for lamp in restored["lamps"]] == [True, False, True]
 
 
 @pytest.mark.parametrize(
@@ -258,12 +258,12 @@ def test_a_link_restores_the_view(page, open_page, html):
      "show=<img src=x>", "light1=,,,,", "%", "light1=0,0,1e9,1e9,zzzzzz"],
 )  # fmt: skip
 def test_links_that_make_no_sense_are_harmless(open_page, html, fragment):
-    found = scene(open_page(html, fragment))
-    assert found["show"] == "picture"
-    assert found["map"]["name"] == "none"
-    assert found["photo"] is None
-    assert np.isfinite([found["camera"]["distance"], found["lamps"][0]["distance"]]).all()
-    assert found["lamps"][0]["distance"] <= 10
+    restored = scene(open_page(html, fragment))
+    assert restored["show"] == "picture"
+    assert restored["map"]["name"] == "none"
+    assert restored["photo"] is None
+    assert np.isfinite([restored["camera"]["distance"], restored["lamps"][0]["distance"]]).all()
+    assert restored["lamps"][0]["distance"] <= 10
 
 
 def test_on_a_phone_the_picture_comes_first(open_page, html):
@@ -307,7 +307,7 @@ class TestMaps:
         lights = EnvironmentMap(radiance).quantise(64)
         return (lights.irradiances.sum(axis=1) @ lights.directions) / lights.irradiances.sum()
 
-    def found(self, lights):
+    def lights_shown(self, lights):
         power = np.array([light["power"] for light in lights]).sum(axis=1)
         return (power @ np.array([light["at"] for light in lights])) / power.sum()
 
@@ -317,7 +317,9 @@ class TestMaps:
         write_map(path, radiance, compression)
         lights = self.dropped(page, path.name, path.read_bytes())
         assert scene(page)["map"]["name"] == "file"
-        np.testing.assert_allclose(self.found(lights), self.expected(radiance), atol=2e-3)
+        np.testing.assert_allclose(
+            self.lights_shown(lights), self.expected(radiance), atol=2e-3
+        )
 
     @pytest.mark.parametrize("coded", [False, True])
     def test_hdr(self, page, radiance, coded):
@@ -325,7 +327,7 @@ class TestMaps:
         rows = [hdr_row(row, coded) for row in codes]
         content = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n" + b"".join(rows)
         lights = self.dropped(page, "map.hdr", content)
-        np.testing.assert_allclose(self.found(lights), self.expected(kept), atol=2e-3)
+        np.testing.assert_allclose(self.lights_shown(lights), self.expected(kept), atol=2e-3)
 
     def test_picture_is_srgb(self, page, rng):
         codes = rng.integers(40, 255, (16, 32, 3)).astype(np.uint8)
@@ -335,7 +337,7 @@ class TestMaps:
         share = codes / 255.0
         linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
         wanted = self.expected(linear.astype(np.float32))
-        np.testing.assert_allclose(self.found(lights), wanted, atol=2e-3)
+        np.testing.assert_allclose(self.lights_shown(lights), wanted, atol=2e-3)
 
     @pytest.mark.parametrize(
         ("name", "content", "why"),

@@ -44,11 +44,11 @@ class Elements(HTMLParser):
 
     def __init__(self, html):
         super().__init__()
-        self.found, self.texts, self.inside = [], {}, None
+        self.tags, self.texts, self.inside = [], {}, None
         self.feed(html)
 
     def handle_starttag(self, tag, attributes):
-        self.found.append((tag, dict(attributes)))
+        self.tags.append((tag, dict(attributes)))
         self.inside = (tag, dict(attributes).get("id"), dict(attributes).get("type"))
 
     def handle_data(self, data):
@@ -99,11 +99,11 @@ class TestPacking:
     @pytest.mark.parametrize("kind", ["noise", "ramp", "empty"])
     def test_arrays_come_back(self, rng, dtype, kind):
         values = rng.integers(-128, 127, (7, 5, 3)) if kind == "noise" else np.arange(105)
-        given = values.reshape(-1, 5, 3).astype(dtype)[: 0 if kind == "empty" else None]
-        back = decoded(packed_block({"first": given, "second": given}))
+        packed = values.reshape(-1, 5, 3).astype(dtype)[: 0 if kind == "empty" else None]
+        back = decoded(packed_block({"first": packed, "second": packed}))
         for name in ("first", "second"):
-            np.testing.assert_array_equal(back[name], given)
-            assert back[name].dtype == given.dtype
+            np.testing.assert_array_equal(back[name], packed)
+            assert back[name].dtype == packed.dtype
 
     def test_smooth_numbers_become_small(self):
         ramp = np.add.outer(np.arange(200), np.arange(300)).astype(np.int16)
@@ -144,7 +144,7 @@ class TestText:
         elements = Elements(page)
         (policy,) = [
             attributes["content"]
-            for _, attributes in elements.found
+            for _, attributes in elements.tags
             if attributes.get("http-equiv") == "Content-Security-Policy"
         ]
         rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
@@ -161,7 +161,7 @@ class TestText:
                 assert f"'sha256-{digest}'" in rules[rule]
 
     def test_nothing_is_fetched(self, page):
-        for tag, attributes in Elements(page).found:
+        for tag, attributes in Elements(page).tags:
             assert tag not in ("link", "iframe", "object", "embed", "base")
             assert not {"src", "href", "srcset", "action", "style"} & set(attributes)
             assert not any(name.startswith("on") for name in attributes)
@@ -169,7 +169,7 @@ class TestText:
         assert not re.search(r"\b(eval|Function)\(|innerHTML|document\.write", page)
 
     def test_names_are_escaped(self, page):
-        tags = [tag for tag, _ in Elements(page).found]
+        tags = [tag for tag, _ in Elements(page).tags]
         assert tags.count("script") == len(re.findall("<script", page)) == 7
         assert "alert(1)</script>" not in page
         assert "&lt;script&gt;alert(1)" in page

@@ -1,6 +1,6 @@
 """Preset by effect: what the plan switches on, what each effect changes, and its cost.
 
-    python examples/effects_of_presets.py
+    python tests/benchmarks/bench_effects.py
 
 Renders a few small photographs of every preset with each effect that it describes and
 without, and prints a Markdown table: the largest change in percent of the photograph's 99th
@@ -16,7 +16,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.measuring import Results
 
@@ -54,13 +54,13 @@ def column(scene: Scene, n_photographs: int) -> tuple[dict[str, str], list[str]]
     tracer = RayTracer(scene.mesh, n_threads=2)
     known = measured(scene, tracer)
     cells, wrong = {}, []
-    found = {
+    shares = {
         one.name: one for one in contributions(known, tracer, some_pairs(known, n_photographs))
     }
     for effect in EFFECTS:
-        if effect.NAME not in found:
+        if effect.NAME not in shares:
             continue
-        one, is_on = found[effect.NAME], effect.NAME in known.effects.active
+        one, is_on = shares[effect.NAME], effect.NAME in known.effects.active
         if (one.change > threshold(known, effect.STAGE)) is not is_on:
             wrong.append(effect.NAME)
         change = (
@@ -69,9 +69,11 @@ def column(scene: Scene, n_photographs: int) -> tuple[dict[str, str], list[str]]
         milliseconds = f" ({max(0.0, 1e3 * one.seconds):.0f})"
         cells[effect.NAME] = f"**{change}**{milliseconds}" if is_on else change
     if known.effects.declared(dropped_photographs.Options):
-        taken = set_up(known).rig.photographed
-        missing = f"{int((~taken).sum())} of {taken.size} missing"
-        cells[dropped_photographs.NAME] = f"**{missing}**" if not taken.all() else missing
+        photographed = set_up(known).rig.photographed
+        missing = f"{int((~photographed).sum())} of {photographed.size} missing"
+        cells[dropped_photographs.NAME] = (
+            f"**{missing}**" if not photographed.all() else missing
+        )
     return cells, wrong
 
 
@@ -88,7 +90,7 @@ def main() -> None:
         mistakes += [f"{name}: {effect}" for effect in wrong]
     print("| effect | " + " | ".join(f"`{name}`" for name in PRESETS) + " |")
     print("|---" * (len(PRESETS) + 1) + "|")
-    results = Results("effects_of_presets", "What each effect changes", ["capture_sim.write"])
+    results = Results("effects", "What each effect changes", ["capture_sim.write"])
     results.table(f"Percent of the 99th percentile; {arguments.side} pixels; (ms); bold: on")
     for effect in EFFECTS:
         cells = [columns[name].get(effect.NAME, "-") for name in PRESETS]

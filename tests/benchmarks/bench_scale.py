@@ -1,9 +1,9 @@
 """The paper's job, 151 x 151 photographs and 256 x 256 texels, on this machine.
 
-    python examples/paper_scale.py OUT             # simulate, process, compress, compare
-    python examples/paper_scale.py OUT --kill 5    # killed five times: the same bytes?
-    python examples/paper_scale.py OUT --kill-worker nanny    # on a cluster that loses workers
-    python examples/paper_scale.py OUT --per-texel 64 128 256
+    python tests/benchmarks/bench_scale.py OUT    # simulate, process, compress, compare
+    python tests/benchmarks/bench_scale.py OUT --kill 5
+    python tests/benchmarks/bench_scale.py OUT --kill-worker nanny
+    python tests/benchmarks/bench_scale.py OUT --per-texel 64 128 256
 
 A vase of glaze and paint with brushed bands of gold stands in a dome. The first form prints
 seconds and peak memory of every stage; the second processes once more, kills the process
@@ -33,7 +33,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import distributed
 from benchmarks.measuring import Results
@@ -142,7 +142,7 @@ def processed(arguments: argparse.Namespace, capture: Path) -> None:
     out = arguments.out / "run"
     call(*process_words(arguments, capture, out, arguments.texels, 2048))
     timings = json.loads((out / "timings.json").read_text())
-    results = Results("paper_scale", "The paper's job", MEASURED)
+    results = Results("scale", "The paper's job", MEASURED)
     size = f"{arguments.pixels} pixels, {arguments.texels} texels a side"
     results.table(f"{arguments.rig}, {size}")
     for stage in timings["stages"]:
@@ -179,11 +179,11 @@ def digests(out: Path) -> dict[str, str]:
         for path in (out / "field.rfld", *files)
         if path.name not in ("stage.json", ".lock") and "report" not in path.parts
     ]
-    found = {}
+    sums = {}
     for path in wanted:
         with path.open("rb") as file:
-            found[str(path.relative_to(out))] = hashlib.file_digest(file, "sha256").hexdigest()
-    return found
+            sums[str(path.relative_to(out))] = hashlib.file_digest(file, "sha256").hexdigest()
+    return sums
 
 
 class Moment(NamedTuple):
@@ -205,13 +205,13 @@ def moments(stages: list[dict[str, Any]], n: int, rng: random.Random) -> list[Mo
     """
     stages = [stage for stage in stages if stage["name"] not in WITHOUT_BLOCKS]
     drawn = rng.choices(range(len(stages)), [stage["seconds"] for stage in stages], k=n)
-    found = []
+    chosen = []
     for i, share in sorted((i, rng.random()) for i in drawn):
         blocks = stages[i]["blocks_computed"]
         seconds = stages[i]["seconds"]
         wait = rng.random() * seconds / (blocks + 1) if blocks else 0.9 * share * seconds
-        found.append(Moment(stages[i]["name"], int(share * blocks), wait))
-    return found
+        chosen.append(Moment(stages[i]["name"], int(share * blocks), wait))
+    return chosen
 
 
 def kept_blocks(out: Path, stage: str) -> dict[str, int]:
@@ -272,8 +272,8 @@ def kill_and_resume(arguments: argparse.Namespace, capture: Path) -> None:
 
 def compare(whole: Path, out: Path) -> None:
     """Print whether two runs made the same bytes; end with status 1 if not."""
-    expected, found = digests(whole), digests(out)
-    different = {name for name in expected | found if expected.get(name) != found.get(name)}
+    expected, actual = digests(whole), digests(out)
+    different = {name for name in expected | actual if expected.get(name) != actual.get(name)}
     print(f"{len(expected)} files compared, {len(different)} differ: {sorted(different)[:9]}")
     if different:
         sys.exit(1)
@@ -284,8 +284,8 @@ def cluster_here(folder: Path, nanny: bool) -> Iterator[distributed.Client]:
     """A scheduler and two workers of one thread, in processes of their own; a client."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    found = folder / "scheduler.json"
-    at = ("--scheduler-file", found.resolve(), "--no-dashboard", "--host", "127.0.0.1")
+    scheduler_file = folder / "scheduler.json"
+    at = ("--scheduler-file", scheduler_file.resolve(), "--no-dashboard", "--host", "127.0.0.1")
     kind = "--nanny" if nanny else "--no-nanny"
     commands = [("scheduler", *at, "--port", 0), *2 * [("worker", *at, kind, "--nthreads", 1)]]
     with ExitStack() as running:
@@ -297,9 +297,9 @@ def cluster_here(folder: Path, nanny: bool) -> Iterator[distributed.Client]:
             running.callback(process.wait)
             running.callback(process.terminate)
         deadline = time.monotonic() + 60
-        while not found.is_file() and time.monotonic() < deadline:
+        while not scheduler_file.is_file() and time.monotonic() < deadline:
             time.sleep(0.1)
-        client = running.enter_context(distributed.Client(scheduler_file=str(found)))
+        client = running.enter_context(distributed.Client(scheduler_file=str(scheduler_file)))
         client.wait_for_workers(2, timeout=60)
         yield client
 
@@ -341,8 +341,8 @@ def processes(client: distributed.Client, lost: set[str]) -> dict[str, int]:
     """Processes of the workers by their addresses, when two are there that are not lost."""
     while len(alive := set(client.nthreads()) - lost) < 2:
         time.sleep(0.1)
-    found: dict[str, int] = client.run(os.getpid, workers=list(alive))
-    return found
+    identifiers: dict[str, int] = client.run(os.getpid, workers=list(alive))
+    return identifiers
 
 
 def kill_worker(
@@ -370,9 +370,9 @@ def kill_worker(
 
 def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
     """Print the processor time of one texel at several sizes of the texture."""
-    print("texture       texels   ms of the processor per texel: " + ", ".join(BY_TEXELS))
+    print("texture       texels   CPU time per texel, ms: " + ", ".join(BY_TEXELS))
     totals = []
-    results = Results("paper_scale_per_texel", "What one texel costs", MEASURED)
+    results = Results("scale_per_texel", "What one texel costs", MEASURED)
     results.table(f"{arguments.rig}, CPU time of a texel, ms")
     for side in arguments.per_texel:
         out = arguments.out / f"texels_{side}"

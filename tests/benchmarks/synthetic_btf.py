@@ -1,8 +1,8 @@
 """The synthetic scene of the paper's section 5.1, rebuilt: frames, directions, samples.
 
 A raised ring and bars on a plane, tangents modulated by cosines, one anisotropic
-material (M. Ashikhmin, P. Shirley, "An anisotropic Phong BRDF model", 2000). The examples,
-the tests of the alignment and its benchmark all use it.
+material (M. Ashikhmin, P. Shirley, "An anisotropic Phong BRDF model", 2000). The tests of
+the alignment and its benchmarks use it.
 """
 
 from __future__ import annotations
@@ -91,29 +91,29 @@ def sample_texels(frames, views, lights, block=128, **material):
     return np.concatenate(parts)
 
 
-def with_the_truths_tangents(found, truth):
+def with_the_truths_tangents(recovered, truth):
     """Recovered frames, all turned alike about their normals so that tangents agree on average.
 
     Data determine the mean tangent of a material only up to such a turn, and this
     anisotropic one every tangent only up to a half turn.
     """
-    sign = np.sign(np.sum(found[:, 0] * truth[:, 0], axis=1))
-    folded = found * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, :, None]
+    sign = np.sign(np.sum(recovered[:, 0] * truth[:, 0], axis=1))
+    folded = recovered * np.stack([sign, sign, np.ones_like(sign)], axis=1)[:, :, None]
     turn = np.einsum("nij,nkj->ik", truth, folded)
     angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ folded
 
 
-def frame_errors(found, truth, half_turn=True):
+def frame_errors(recovered, truth, half_turn=True):
     """Angles between normals and between tangents (as axes if `half_turn`), degrees."""
-    normal = np.sum(found[:, 2] * truth[:, 2], axis=1)
+    normal = np.sum(recovered[:, 2] * truth[:, 2], axis=1)
     # Both tangents are compared in the plane of the true normal.
-    t = found[:, 0] - np.sum(found[:, 0] * truth[:, 2], axis=1)[:, None] * truth[:, 2]
+    t = recovered[:, 0] - np.sum(recovered[:, 0] * truth[:, 2], axis=1)[:, None] * truth[:, 2]
     t /= np.linalg.norm(t, axis=1, keepdims=True)
     tangent = np.sum(t * truth[:, 0], axis=1)
     tangent = np.abs(tangent) if half_turn else tangent
-    chord = np.linalg.norm(found[:, 2] - truth[:, 2], axis=1)
+    chord = np.linalg.norm(recovered[:, 2] - truth[:, 2], axis=1)
     normal_angle = np.where(
         normal > 0.9, 2 * np.arcsin(np.minimum(chord / 2, 1)), np.arccos(normal.clip(-1, 1))
     )
