@@ -1,0 +1,63 @@
+"""The formats that are read: by which files each is recognised, and by which function read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from reflfield.capture import (
+    colmap,
+    kintsugi,
+    llff,
+    lp,
+    metashape,
+    middlebury,
+    native,
+    transforms_json,
+)
+from reflfield.capture.capture import Capture
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A way to read captures.
+
+    Parameters
+    ----------
+    patterns : tuple of str
+        Globs of its descriptions, within the capture's folder.
+    read : callable
+        ``read(description, follow_links=...)``: the capture.
+    recognises : callable, optional
+        Whether a file of these names is of the format; by default all are.
+    """
+
+    patterns: tuple[str, ...]
+    read: Callable[..., Capture]
+    recognises: Callable[[Path], bool] = Path.is_file
+
+    def descriptions(self, folder: Path) -> list[Path]:
+        """Files in a folder that are of this format."""
+        files = [path for pattern in self.patterns for path in sorted(folder.glob(pattern))]
+        return [path for path in files if not path.is_dir() and self.recognises(path)]
+
+
+def _any(path: Path) -> bool:
+    return True
+
+
+# Formats that are made for captures: one of them counts before what other programs leave.
+OWN_READERS = {
+    "native": Reader((native.FILE_NAME,), native.read_native, _any),
+    "transforms": Reader((transforms_json.FILE_NAME,), transforms_json.read_transforms, _any),
+    "middlebury": Reader(("*" + middlebury.SUFFIX,), middlebury.read_middlebury, _any),
+    "lp": Reader(("*" + lp.SUFFIX,), lp.read_lp, _any),
+}
+OTHER_READERS = {
+    "colmap": Reader(colmap.PATTERNS, colmap.read_colmap, colmap.is_colmap),
+    "metashape": Reader(("*.xml",), metashape.read_metashape, metashape.is_metashape),
+    "kintsugi": Reader(("*" + kintsugi.SUFFIX,), kintsugi.read_view_set),
+    "llff": Reader((llff.FILE_NAME,), llff.read_llff),
+}
+READERS = {**OWN_READERS, **OTHER_READERS}
