@@ -15,6 +15,7 @@ from reflfield.capture.image_files import AS_STATED, ImageReading, image_size
 from reflfield.capture.lights import Light
 from reflfield.capture.names import unique_names
 from reflfield.capture.orientation import estimated_up
+from reflfield.capture.paths import NamedFiles
 from reflfield.capture.unique_items import UniqueItems, camera_key, leading_digits, numbered
 from reflfield.capture.view_folders import ViewFolders
 from reflfield.errors import CaptureError
@@ -96,53 +97,68 @@ def capture_of_views(
     sizes = [
         _reduction(view, of) for view, (of, _) in zip(used, present or located, strict=True)
     ]
-    return _assembled(
-        *(used, paths, folders),
+    masks = [folders.mask(path) for path in paths]
+    capture = assembled_capture(
+        *(used, paths, masks, folders.files),
         format=format,
         details=(*details, *_size_details(sizes), *_mask_details(folders)),
         notes=notes,
         reading=reading,
     )
+    more = _mask_notes(folders, capture.silhouettes)
+    return replace(capture, notes=(*capture.notes, *more))
 
 
-def _assembled(
+def assembled_capture(
     views: Sequence[View],
     paths: Sequence[Path],
-    folders: ViewFolders,
+    masks: Sequence[Path | None],
+    files: NamedFiles,
     *,
     format: str,
     details: Sequence[str],
-    notes: list[str],
-    reading: ImageReading,
+    notes: Sequence[str] = (),
+    reading: ImageReading = AS_STATED,
 ) -> Capture:
-    """Capture of views in the size of their photographs."""
+    """Make a capture of photographs, their cameras and their lights.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Cameras in the size of their photographs. Identical cameras and lights are one.
+    paths, masks : sequence of Path
+        Of each view its photograph and its mask, if there is one. Of several masks of one
+        camera the first counts.
+    files : NamedFiles
+        Of the description.
+    format, details, notes, reading
+        As `capture_of_views`.
+    """
     cameras, lights = UniqueItems(), UniqueItems()
-    masks: dict[int, Path] = {}
+    silhouettes: dict[int, Path] = {}
     photographs = []
-    names = unique_names(list(paths), folders.root)
-    for name, view, path in zip(names, views, paths, strict=True):
+    names = unique_names(list(paths), files.root)
+    for name, view, path, mask in zip(names, views, paths, masks, strict=True):
         camera = cameras.add(camera_key(view.camera), view.camera)
         light = lights.add(_light_key(view.light), view.light)
-        mask = folders.mask(path)
         if mask is not None:
-            masks.setdefault(camera, mask)
+            silhouettes.setdefault(camera, mask)
         photographs.append(Photograph(name, camera, light, (Exposure(path, reading=reading),)))
     check_counts(
-        str(folders.files.description), len(cameras.items), len(lights.items), len(photographs)
+        str(files.description), len(cameras.items), len(lights.items), len(photographs)
     )
-    silhouettes = tuple(masks.get(i) for i in range(len(cameras.items)))
     return Capture(
-        name=printable(folders.root.resolve().name),
-        root=folders.root,
+        name=printable(files.root.resolve().name),
+        root=files.root,
         cameras=numbered(cameras.items, "v"),
         lights=numbered(lights.items, "l"),
         photographs=tuple(photographs),
         base_geometry=usual_base_geometry(len(cameras.items)),
-        silhouettes=silhouettes,
+        silhouettes=tuple(silhouettes.get(i) for i in range(len(cameras.items))),
         up=estimated_up(cameras.items),
         format=format,
-        description=folders.files.description,
-        notes=(*notes, *_mask_notes(folders, silhouettes)),
+        description=files.description,
+        notes=tuple(notes),
         details=tuple(details),
     )
 

@@ -8,12 +8,18 @@ from pathlib import Path
 
 from reflfield.capture import (
     colmap,
+    diligent_mv,
     kintsugi,
+    light_lists,
     llff,
     lp,
     metashape,
     middlebury,
     native,
+    near_light_mat,
+    openillumination,
+    relight_dome,
+    rene,
     transforms_json,
 )
 from reflfield.capture.capture import Capture
@@ -59,5 +65,23 @@ OTHER_READERS = {
     "metashape": Reader(("*.xml",), metashape.read_metashape, metashape.is_metashape),
     "kintsugi": Reader(("*" + kintsugi.SUFFIX,), kintsugi.read_view_set),
     "llff": Reader((llff.FILE_NAME,), llff.read_llff),
+    "dome": Reader(("*" + relight_dome.SUFFIX,), relight_dome.read_dome),
+    "lights": Reader(
+        light_lists.PATTERNS, light_lists.read_light_list, light_lists.is_light_list
+    ),
+    "diligent-mv": Reader(
+        (diligent_mv.FILE_NAME,), diligent_mv.read_diligent_mv, diligent_mv.is_diligent_mv
+    ),
+    "openillumination": Reader(
+        (openillumination.PATTERN,),
+        openillumination.read_openillumination,
+        openillumination.is_openillumination,
+    ),
+    "rene": Reader(rene.PATTERNS, rene.read_rene, rene.is_rene),
+    "near-light": Reader(
+        (near_light_mat.FILE_NAME,),
+        near_light_mat.read_near_light_mat,
+        near_light_mat.is_near_light_mat,
+    ),
 }
 READERS = {**OWN_READERS, **OTHER_READERS}
