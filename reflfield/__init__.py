@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
-    from reflfield.api.captures import describe_capture, open_capture
+    from reflfield.api.captures import convert_capture, describe_capture, open_capture
     from reflfield.api.example import example_field
     from reflfield.api.fields import Field, open_field
     from reflfield.api.images import compare, relight, render_turntable
@@ -105,6 +105,7 @@ __all__ = [
     "TextureOptions",
     "VisibilityOptions",
     "compare",
+    "convert_capture",
     "describe_capture",
     "example_field",
     "open_capture",
@@ -117,7 +118,7 @@ __all__ = [
 
 # Module of each name; type checkers see the imports above.
 _MODULES = {
-    "reflfield.api.captures": ("describe_capture", "open_capture"),
+    "reflfield.api.captures": ("convert_capture", "describe_capture", "open_capture"),
     "reflfield.api.example": ("example_field",),
     "reflfield.api.fields": ("Field", "open_field"),
     "reflfield.api.images": ("compare", "relight", "render_turntable"),
