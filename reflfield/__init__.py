@@ -35,7 +35,12 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
-    from reflfield.api.captures import convert_capture, describe_capture, open_capture
+    from reflfield.api.captures import (
+        convert_btf,
+        convert_capture,
+        describe_capture,
+        open_capture,
+    )
     from reflfield.api.example import example_field
     from reflfield.api.fields import Field, open_field
     from reflfield.api.images import compare, relight, render_turntable
@@ -105,6 +110,7 @@ __all__ = [
     "TextureOptions",
     "VisibilityOptions",
     "compare",
+    "convert_btf",
     "convert_capture",
     "describe_capture",
     "example_field",
@@ -118,7 +124,9 @@ __all__ = [
 
 # Module of each name; type checkers see the imports above.
 _MODULES = {
-    "reflfield.api.captures": ("convert_capture", "describe_capture", "open_capture"),
+    "reflfield.api.captures": (
+        *("convert_btf", "convert_capture", "describe_capture", "open_capture"),
+    ),
     "reflfield.api.example": ("example_field",),
     "reflfield.api.fields": ("Field", "open_field"),
     "reflfield.api.images": ("compare", "relight", "render_turntable"),

@@ -436,9 +436,13 @@ def convert(
     encoding: EncodingOption = None,
     layer: LayerOption = None,
 ) -> None:
-    """Write a capture in another format; what that cannot say is refused."""
-    from reflfield.api.captures import convert_capture, open_capture
+    """Write a capture, or a .btf, in another format; what that cannot say is refused."""
+    from reflfield.api.captures import convert_btf, convert_capture, open_capture
 
+    if capture.suffix.lower() == ".btf" and to == "native":
+        with working():
+            say(f"{convert_btf(capture, out)} images in {out}")
+        return
     opened = open_capture(
         capture, format, encoding=encoding, layer=layer, follow_links=follow_links
     )

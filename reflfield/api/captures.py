@@ -94,3 +94,25 @@ def convert_capture(
         If the folder is not empty, or the format cannot say what the capture does.
     """
     return conversion.convert_capture(capture, out, to, link=link)
+
+
+def convert_btf(path: Path | str, out: Path | str) -> int:
+    """Write a ``.btf`` container as a capture of a flat sample; the number of its images.
+
+    Parameters
+    ----------
+    path : Path or str
+        Of the University of Bonn's formats FMF, DFMF or BDI, with rotations of texels or not.
+    out : Path or str
+        A folder that is new or empty.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    InputError
+        If the folder is not empty, or the container is damaged or not supported.
+    """
+    return conversion.convert_btf(path, out)

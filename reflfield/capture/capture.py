@@ -485,6 +485,7 @@ def _indices(name: str, indices: ArrayLike | None, count: int) -> list[int]:
 def _camera_text(camera: Camera) -> str:
     numbers: list[Any] = [camera.width, camera.height, camera.fl_x, camera.fl_y]
     numbers += [camera.cx, camera.cy, camera.distortion, camera.camera_from_world.tolist()]
+    numbers += [camera.skew] if camera.skew else []
     return f"{camera.id} {camera.kind} {numbers}"
 
 

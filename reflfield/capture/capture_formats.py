@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from reflfield.capture import (
+    btf_names,
     colmap,
     diligent_mv,
     kintsugi,
@@ -37,16 +39,20 @@ class Reader:
         ``read(description, follow_links=...)``: the capture.
     recognises : callable, optional
         Whether a file of these names is of the format; by default all are.
+    by_one_of_many : bool
+        Whether the first of the files stands for all.
     """
 
     patterns: tuple[str, ...]
     read: Callable[..., Capture]
     recognises: Callable[[Path], bool] = Path.is_file
+    by_one_of_many: bool = False
 
     def descriptions(self, folder: Path) -> list[Path]:
         """Files in a folder that are of this format."""
-        files = [path for pattern in self.patterns for path in sorted(folder.glob(pattern))]
-        return [path for path in files if not path.is_dir() and self.recognises(path)]
+        files = (path for pattern in self.patterns for path in sorted(folder.glob(pattern)))
+        fitting = (path for path in files if not path.is_dir() and self.recognises(path))
+        return list(islice(fitting, 1 if self.by_one_of_many else None))
 
 
 def _any(path: Path) -> bool:
@@ -78,6 +84,12 @@ OTHER_READERS = {
         openillumination.is_openillumination,
     ),
     "rene": Reader(rene.PATTERNS, rene.read_rene, rene.is_rene),
+    "btf-images": Reader(
+        btf_names.PATTERNS,
+        btf_names.read_btf_images,
+        btf_names.is_btf_image,
+        by_one_of_many=True,
+    ),
     "near-light": Reader(
         (near_light_mat.FILE_NAME,),
         near_light_mat.read_near_light_mat,

@@ -8,15 +8,15 @@ Newer models hold rigs and frames, too: the poses of images hold without them.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.binary_files import BinaryFile, opened
 from reflfield.capture.cameras import FISHEYE, OPENCV, Camera
 from reflfield.capture.described_items import described_camera
 from reflfield.capture.documents import (
@@ -27,9 +27,7 @@ from reflfield.capture.documents import (
     read_text,
 )
 from reflfield.capture.lenses import NAMES as LENS_TERMS
-from reflfield.capture.paths import LONGEST_PATH
 from reflfield.errors import CaptureError
-from reflfield.util.files import check_regular
 from reflfield.util.quoting import quoted
 
 # Number of each camera model in binary files, its name, and its parameters where it is
@@ -99,10 +97,10 @@ def read_model(folder: Path, suffix: str) -> tuple[dict[int, ModelCamera], list[
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     if suffix == ".txt":
         return _cameras_of_text(cameras), _images_of_text(images)
-    with _opened(cameras) as file:
-        lenses = _cameras_of_binary(_Binary(file, cameras))
-    with _opened(images) as file:
-        return lenses, _images_of_binary(_Binary(file, images))
+    with opened(cameras) as file:
+        lenses = _cameras_of_binary(BinaryFile(file, cameras))
+    with opened(images) as file:
+        return lenses, _images_of_binary(BinaryFile(file, images))
 
 
 def model_camera(lens: ModelCamera, image: ModelImage, what: str) -> Camera:
@@ -255,79 +253,7 @@ def _refuse_line(path: Path, expected: str, line: str) -> NoReturn:
 # --- binary -------------------------------------------------------------------------------
 
 
-def _opened(path: Path) -> IO[bytes]:
-    check_regular(path, CaptureError)
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
-class _Binary:
-    """A little-endian file that is read in order; counts are compared with its size first."""
-
-    def __init__(self, file: IO[bytes], path: Path) -> None:
-        self.file, self.path = file, path
-        self.left = check_regular(path, CaptureError)
-
-    def numbers(self, layout: str) -> tuple[Any, ...]:
-        """Numbers of a `struct` layout."""
-        return struct.unpack(f"<{layout}", self.bytes(struct.calcsize(f"<{layout}")))
-
-    def bytes(self, n_bytes: int) -> bytes:
-        """The next bytes."""
-        self._demand(n_bytes)
-        content = self.file.read(n_bytes)
-        self.left -= n_bytes
-        if len(content) != n_bytes:
-            raise CaptureError(f"{self.path}: the file shrinks while it is read; is it in use?")
-        return content
-
-    def skip(self, n_bytes: int) -> None:
-        """Leave out bytes."""
-        self._demand(n_bytes)
-        self.file.seek(n_bytes, 1)
-        self.left -= n_bytes
-
-    def count(self, what: str, least_bytes: int, most: int | None = None) -> int:
-        """A number of things of which each takes some bytes at least."""
-        n: int = self.numbers("Q")[0]
-        if n * least_bytes > self.left or (most is not None and n > most):
-            raise CaptureError(
-                f"{self.path}: expected at most {most or self.left // least_bytes:,} {what}, "
-                f"received a count of {n:,}; the file is damaged, truncated or none of COLMAP's"
-            )
-        return n
-
-    def text(self) -> str:
-        """Text up to a zero byte."""
-        content = bytearray()
-        while (byte := self.bytes(1)) != b"\0":
-            content += byte
-            if len(content) > LONGEST_PATH:
-                raise CaptureError(
-                    f"{self.path}: expected names of at most {LONGEST_PATH} bytes, received a "
-                    "longer one; the file is damaged or none of COLMAP's"
-                )
-        return content.decode("utf-8", errors="replace")
-
-    def end(self) -> None:
-        """Refuse what goes on."""
-        if self.left:
-            raise CaptureError(
-                f"{self.path}: expected the end of the file, received {self.left:,} more "
-                "bytes; is it of another program or version?"
-            )
-
-    def _demand(self, n_bytes: int) -> None:
-        if n_bytes > self.left:
-            raise CaptureError(
-                f"{self.path}: expected {n_bytes:,} more bytes, received {self.left:,}: the "
-                "file is truncated; copy it again"
-            )
-
-
-def _cameras_of_binary(data: _Binary) -> dict[int, ModelCamera]:
+def _cameras_of_binary(data: BinaryFile) -> dict[int, ModelCamera]:
     lenses: dict[int, ModelCamera] = {}
     for _ in range(data.count("cameras", _LEAST_CAMERA_BYTES, MAX_PHOTOGRAPHS)):
         id_, number, width, height = data.numbers("IiQQ")
@@ -340,7 +266,7 @@ def _cameras_of_binary(data: _Binary) -> dict[int, ModelCamera]:
     return lenses
 
 
-def _images_of_binary(data: _Binary) -> list[ModelImage]:
+def _images_of_binary(data: BinaryFile) -> list[ModelImage]:
     images = []
     for _ in range(data.count("images", _LEAST_IMAGE_BYTES, MAX_PHOTOGRAPHS)):
         _, *numbers, camera = data.numbers("I7dI")

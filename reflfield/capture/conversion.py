@@ -9,6 +9,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from reflfield.capture.btf import read_btf
+from reflfield.capture.btf_conversion import write_btf_samples
 from reflfield.capture.capture import Capture
 from reflfield.capture.colmap_writing import colmap_description
 from reflfield.capture.native_writing import native_description
@@ -17,6 +19,7 @@ from reflfield.capture.written_files import WrittenFiles
 from reflfield.errors import InputError
 from reflfield.util.files import filling
 from reflfield.util.folders import link_file
+from reflfield.util.quoting import printable
 
 # Writes the description of a capture whose files are `WrittenFiles`.
 _Writer = Callable[[Capture, WrittenFiles], None]
@@ -58,9 +61,33 @@ def convert_capture(
     if to not in TARGETS:
         raise InputError(f"to: expected {', '.join(TARGETS)}, received {to!r}")
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"out: expected a new or empty folder, received {out}; choose another")
+    _check_empty(out)
     with filling(out) as partial:
         files = WrittenFiles(partial, link_file if link else shutil.copyfile)
         TARGETS[to](capture, files)
         return [out / path.relative_to(partial) for path in files.written]
+
+
+def convert_btf(path: Path | str, out: Path | str) -> int:
+    """Write a ``.btf`` container as a native capture; the number of its images.
+
+    Parameters
+    ----------
+    path : Path or str
+        The container.
+    out : Path or str
+        A folder that is new or empty.
+
+    Raises
+    ------
+    InputError
+        If the folder is not empty, or the container cannot be read.
+    """
+    out = Path(out)
+    _check_empty(out)
+    return write_btf_samples(read_btf(path), out, printable(Path(path).stem) or "btf")
+
+
+def _check_empty(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"out: expected a new or empty folder, received {out}; choose another")

@@ -52,7 +52,7 @@ def native_description(capture: Capture, files: WrittenFiles) -> None:
         "base_geometry": capture.base_geometry,
         "up": capture.up.tolist(),
         "cameras": [
-            _camera(camera, id_, silhouette)
+            camera_entry(camera, id_, silhouette)
             for camera, id_, silhouette in zip(
                 capture.cameras, cameras, silhouettes, strict=True
             )
@@ -72,13 +72,16 @@ def _ids(ids: Sequence[str], letter: str) -> list[str]:
     return [f"{letter}{i:04d}" for i in range(len(ids))]
 
 
-def _camera(camera: Camera, id_: str, silhouette: str | None) -> dict[str, Any]:
+def camera_entry(camera: Camera, id_: str, silhouette: str | None) -> dict[str, Any]:
+    """Entry of a camera in ``capture.json``, with the name of its silhouette's file."""
     entry: dict[str, Any] = {
         "id": id_, "model": camera.kind, "w": camera.width, "h": camera.height,
         "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx, "cy": camera.cy,
         **{k: v for k, v in zip(LENS_KEYS, camera.distortion, strict=True) if v},
         "camera_from_world": camera.camera_from_world.tolist(),
     }  # fmt: skip
+    if camera.skew:
+        entry["skew"] = camera.skew
     if silhouette is not None:
         entry["silhouette"] = silhouette
     return entry

@@ -9,7 +9,7 @@ from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
-from reflfield.capture import middlebury, native, transforms_json
+from reflfield.capture import btf, middlebury, native, transforms_json
 from reflfield.capture.capture import Capture
 from reflfield.capture.capture_formats import OTHER_READERS, OWN_READERS, READERS, Reader
 from reflfield.capture.consistency import (
@@ -150,6 +150,7 @@ def _descriptions(
 
 def _kind_of_file(path: Path) -> str:
     """Format of a description file, by its name and by what it holds."""
+    _refuse_btf(path)
     for name, reader in OTHER_READERS.items():
         ends = {pattern.rpartition("/")[2] for pattern in reader.patterns}
         if any(fnmatch(path.name, end) for end in ends) and reader.recognises(path):
@@ -172,3 +173,12 @@ def _kind_of_file(path: Path) -> str:
         f"{path}: expected a capture description (capture.json, transforms.json, *_par.txt, "
         f"*.lp or another of the formats in the README), received {json.dumps(text[:40])}"
     )
+
+
+def _refuse_btf(path: Path) -> None:
+    """Say how a BTF container becomes a capture."""
+    if path.suffix.lower() == btf.SUFFIX:
+        raise CaptureError(
+            f"{path}: expected a capture, received a BTF container; write it as one first, "
+            f"with `reflfield convert {path.name} -o FOLDER`"
+        )

@@ -51,7 +51,7 @@ def leading_digits(numbers: NDArray[np.float64]) -> tuple[float | str, ...]:
 
 def camera_key(camera: Camera) -> Hashable:
     """Equal for cameras that differ by the rounding of whatever wrote them."""
-    inner = np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy])
+    inner = np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.skew])
     pose = camera.camera_from_world
     return (
         camera.kind,
