@@ -438,8 +438,9 @@ def convert(
 ) -> None:
     """Write a capture, or a .btf, in another format; what that cannot say is refused."""
     from reflfield.api.captures import convert_btf, convert_capture, open_capture
+    from reflfield.capture.conversion import holds_btf
 
-    if capture.suffix.lower() == ".btf" and to == "native":
+    if to == "native" and holds_btf(capture):
         with working():
             say(f"{convert_btf(capture, out)} images in {out}")
         return

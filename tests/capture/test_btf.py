@@ -233,6 +233,34 @@ def test_a_container_becomes_a_capture(tmp_path, table):
         convert_btf(tmp_path / "a.btf", tmp_path / "out")
 
 
+def test_means(tmp_path, rng):
+    """Four directions; the value is exp(3 mean), grey."""
+    directions = directions_of_angles(VIEWS[:4])
+    folder = tmp_path / "means"
+    folder.mkdir()
+    np.vstack([directions.T, [0, 1, 2, 3]]).tofile(folder / "xyz_loc.bin")
+    means = rng.uniform(-1, 1, (2, 4, 4))
+    means.tofile(folder / "felt_mean_std.bin")
+    assert convert_btf(folder, tmp_path / "out") == 16
+    capture = open_capture(tmp_path / "out")
+    assert len({photograph.path for photograph in capture.photographs}) == 4
+    for view in range(4):
+        for light in range(4):
+            image = capture.read_photograph(int(capture.photograph_index[view, light]))
+            np.testing.assert_allclose(image, np.exp(3 * means[0, view, light]), rtol=6e-4)
+    means[:1].tofile(folder / "felt_mean_std.bin")
+    with pytest.raises(CaptureError, match="of 4 x 4 directions"):
+        convert_btf(folder, tmp_path / "other")
+
+
+@pytest.mark.slow
+def test_felt(shared_data, tmp_path):
+    """The mean of a felt on the directions of the Bonn dome."""
+    assert convert_btf(shared_data("ubo2014_felt05"), tmp_path / "out") == 151 * 151
+    capture = open_capture(tmp_path / "out")
+    assert (capture.n_views, capture.n_lights) == (151, 151)
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
