@@ -40,7 +40,12 @@ from typing import Any as _Any
 if _TYPE_CHECKING:
     from reflfield.alignment.align_texels import Alignment, align
     from reflfield.alignment.refinement import RefinementOptions
-    from reflfield.api.captures import describe_capture, open_capture
+    from reflfield.api.captures import (
+        convert_btf,
+        convert_capture,
+        describe_capture,
+        open_capture,
+    )
     from reflfield.api.example import example_field
     from reflfield.api.fields import Field, open_field
     from reflfield.api.images import compare, relight, render_turntable
@@ -116,6 +121,8 @@ __all__ = [
     "align",
     "compare",
     "complete",
+    "convert_btf",
+    "convert_capture",
     "describe_capture",
     "example_field",
     "open_capture",
@@ -130,7 +137,9 @@ __all__ = [
 _MODULES = {
     "reflfield.alignment.align_texels": ("Alignment", "align"),
     "reflfield.alignment.refinement": ("RefinementOptions",),
-    "reflfield.api.captures": ("describe_capture", "open_capture"),
+    "reflfield.api.captures": (
+        *("convert_btf", "convert_capture", "describe_capture", "open_capture"),
+    ),
     "reflfield.api.example": ("example_field",),
     "reflfield.api.fields": ("Field", "open_field"),
     "reflfield.api.images": ("compare", "relight", "render_turntable"),

@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from reflfield import __version__
+from reflfield.cli_messages import say_metrics, say_results
 from reflfield.errors import InputError, ReflfieldError
 from reflfield.flags import FLAGS, current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
@@ -29,7 +30,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="Dome photographs to relightable objects.",
 )
-MISSED = 3  # status where the quality that was asked for is not reached
 LONGEST_MESSAGE = 1600
 NOTHING_LEFT = "nothing half-written is left"
 GOES_ON = "the same command goes on where it stopped"
@@ -51,7 +51,7 @@ Out = Annotated[
 ]
 Format = Annotated[
     str | None,
-    typer.Option(help="native, transforms, middlebury or lp; detected by content if absent."),
+    typer.Option(help="Such as colmap; detected by content if absent."),
 ]
 FollowLinks = Annotated[
     bool,
@@ -421,6 +421,36 @@ def inspect(
         say(line)
 
 
+@app.command()
+def convert(
+    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    out: Out,
+    to: Annotated[
+        str, typer.Option(metavar="native|transforms|colmap", help="Format to write.")
+    ] = "native",
+    link: Annotated[
+        bool, typer.Option("--link", help="Link the photographs instead of copying them.")
+    ] = False,
+    format: Format = None,
+    follow_links: FollowLinks = False,
+    encoding: EncodingOption = None,
+    layer: LayerOption = None,
+) -> None:
+    """Write a capture, or a .btf, in another format; what that cannot say is refused."""
+    from reflfield.api.captures import convert_btf, convert_capture, open_capture
+    from reflfield.capture.conversion import holds_btf
+
+    if to == "native" and holds_btf(capture):
+        with working():
+            say(f"{convert_btf(capture, out)} images in {out}")
+        return
+    opened = open_capture(
+        capture, format, encoding=encoding, layer=layer, follow_links=follow_links
+    )
+    written = convert_capture(opened, out, to, link=link)
+    say(f"{len(opened.photographs)} photographs, {len(written)} files in {out}")
+
+
 # --- helpers ------------------------------------------------------------------------------
 
 
@@ -452,46 +482,6 @@ def n_workers(wanted: int) -> int:
             f"--workers: expected 1 to {MOST_WORKERS}, or 0 for one per core, received {wanted}"
         )
     return wanted or available_cores()
-
-
-def say_results(result: Any, started: float) -> None:
-    """Time per stage, metrics, and where everything is."""
-    for record in result.stages:
-        state = "unchanged" if record.reused else f"{record.seconds:.1f} s"
-        say(f"{record.name:<22}{state:>10}  {record.peak_bytes / 2**30:5.2f} GB")
-    for note in result.notes:
-        say(note)
-    if result.metrics:
-        say_metrics(result.metrics)
-    say(f"total             {time.perf_counter() - started:8.1f} s")
-    for path in result.files:
-        say(str(path))
-    if result.missed_quality:
-        say_error(f"reflfield: {result.missed_quality}")
-        raise typer.Exit(MISSED)
-
-
-def say_metrics(metrics: dict[str, Any]) -> None:
-    """Mean metrics in one line, and on what they were measured in another."""
-    mean, n = metrics["mean"], len(metrics["frames"])
-    if not mean:
-        return
-    say(
-        f"{n} frame{'' if n == 1 else 's'}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
-        f"{mean['psnr_hdr']:.2f} dB (HDR), SSIM {mean['ssim']:.4f}, FLIP {mean['flip']:.4f}"
-    )
-    measured = metrics["measured"]
-    parts = [f"measured on {measured['pixels']} pixels"]
-    if left_out := measured["saturated_pixels_left_out"]:
-        parts.append(f"{left_out} saturated ones left out")
-    if names := measured["frames_not_measured"]:
-        parts.append(f"without a pixel of the object: {', '.join(names)}")
-    origins = ", ".join(f"{name} {n}" for name, n in measured["silhouettes"].items())
-    say("; ".join([*parts, f"silhouettes: {origins}"]))
-    from reflfield.report.sections import analysis_lines
-
-    for line in analysis_lines(metrics):
-        say(with_flags(line))
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ PACKAGES = (
     "api",
     "demo",
     "flags",
+    "cli_messages",
     "cli",
     "__main__",
 )
@@ -38,6 +39,7 @@ PACKAGES = (
 # is heard while libraries are imported.
 IMPORTS_LATE = {
     Path("reflfield/cli.py"),
+    Path("reflfield/cli_messages.py"),
     Path("reflfield/__main__.py"),
     Path("capture_sim/__main__.py"),
 }

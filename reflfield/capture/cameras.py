@@ -7,7 +7,8 @@ Conventions, kept by every camera of the package:
   image covers ``[0, width] x [0, height]``.
 * ``u = fl_x x' + cx``, ``v = fl_y y' + cy`` for coordinates ``(x', y')`` behind the lens
   (`reflfield.capture.lenses`). An orthographic camera takes ``(x', y') = (X, Y)``; its focal
-  lengths are pixels per metre.
+  lengths are pixels per metre, and ``u`` has a term ``skew y'`` more: so a photograph is
+  described that was rectified to a plane which the camera sees at a slant.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ class Camera:
     distortion : tuple of up to 8 float
         ``k1, k2, p1, p2, k3, k4, k5, k6`` in the order of `cv2.projectPoints`; those left
         out are 0. A fisheye has only k1 .. k4.
+    skew : float
+        Of an orthographic camera, pixels per metre.
 
     Raises
     ------
@@ -93,6 +96,7 @@ class Camera:
     cy: float
     camera_from_world: Array
     distortion: tuple[float, ...] = ()
+    skew: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -184,7 +188,8 @@ class Camera:
     @property
     def matrix(self) -> Array:
         """(3, 3) intrinsic matrix K."""
-        return np.array([[self.fl_x, 0.0, self.cx], [0.0, self.fl_y, self.cy], [0.0, 0.0, 1.0]])
+        across = [self.fl_x, self.skew, self.cx]
+        return np.array([across, [0.0, self.fl_y, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: ArrayLike) -> tuple[Array, Array]:
         """Pixels and depths of world points.
@@ -212,7 +217,10 @@ class Camera:
         x_camera = world @ self.rotation.T + self.camera_from_world[:3, 3]
         depth = x_camera[:, 2]
         image = x_camera[:, :2] if self.kind == ORTHOGRAPHIC else self._through_lens(x_camera)
-        return image * (self.fl_x, self.fl_y) + (self.cx, self.cy), depth.copy()
+        pixels = image * (self.fl_x, self.fl_y) + (self.cx, self.cy)
+        if self.skew:
+            pixels[:, 0] += self.skew * image[:, 1]
+        return pixels, depth.copy()
 
     def rays(self, pixels: ArrayLike) -> tuple[Array, Array]:
         """Rays through pixels.
@@ -240,6 +248,7 @@ class Camera:
         check_shape("pixels", image, (None, 2))
         image = (image - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
         if self.kind == ORTHOGRAPHIC:
+            image[:, 0] -= self.skew / self.fl_x * image[:, 1]
             origins = self.centre + image @ self.rotation[:2]
             return origins, np.tile(self.forward, (len(image), 1))
         ideal = image if self.keeps_lines_straight else self._before_lens(image)
@@ -408,7 +417,13 @@ def _check_intrinsics(camera: Camera) -> None:
             f"camera {camera.id!r}: expected at most {n_named} distortion coefficients "
             f"({', '.join(lenses.NAMES)}), received {len(camera.distortion)}"
         )
-    numbers = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, *camera.distortion]
+    if camera.skew and camera.kind != ORTHOGRAPHIC:
+        raise CaptureError(
+            f"camera {camera.id!r}: skew: expected 0 of a camera that is not orthographic, "
+            f"received {camera.skew}; rectify the photographs first"
+        )
+    inner = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.skew]
+    numbers = [*inner, *camera.distortion]
     if not all(abs(n) <= LARGEST_NUMBER for n in numbers):  # False for NaN
         raise CaptureError(
             f"camera {camera.id!r}: expected finite intrinsics of at most {LARGEST_NUMBER:g}, "

@@ -136,6 +136,8 @@ class Capture:
         The file that was read.
     notes : tuple of str, optional
         What a user should know of how it was read.
+    details : tuple of str, optional
+        How it was read, for those who ask.
 
     Raises
     ------
@@ -154,6 +156,7 @@ class Capture:
     format: str = "native"
     description: Path | None = None
     notes: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.silhouettes:
@@ -482,6 +485,7 @@ def _indices(name: str, indices: ArrayLike | None, count: int) -> list[int]:
 def _camera_text(camera: Camera) -> str:
     numbers: list[Any] = [camera.width, camera.height, camera.fl_x, camera.fl_y]
     numbers += [camera.cx, camera.cy, camera.distortion, camera.camera_from_world.tolist()]
+    numbers += [camera.skew] if camera.skew else []
     return f"{camera.id} {camera.kind} {numbers}"
 
 

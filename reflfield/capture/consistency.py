@@ -30,10 +30,10 @@ def check_pairs(capture: Capture) -> None:
                 raise CaptureError(
                     f"{capture.description}: light positions are missing: camera {camera.id!r} "
                     f"has {n} photographs ({names} among them), and nothing says how their "
-                    "lights differ; give each frame of transforms.json its light's 'pl_pos' "
-                    "(and 'pl_intensity') or 'environment', or list the lights in "
-                    "capture.json; where the lighting never changes, keep one photograph per "
-                    "camera"
+                    "lights differ; list the lights in lights.csv, give each frame of "
+                    "transforms.json its light's 'pl_pos' (and 'pl_intensity') or "
+                    "'environment', or list them in capture.json; where the lighting never "
+                    "changes, keep one photograph per camera"
                 )
             raise CaptureError(
                 f"{capture.description}: duplicate photograph of camera {camera.id!r} under "

@@ -12,6 +12,7 @@ from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.capture.capture import PLANE, Capture
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT
 from reflfield.util.progress import track
+from reflfield.util.quoting import printable
 
 Range = tuple[float, float]
 
@@ -54,6 +55,8 @@ class CaptureSummary:
         nearest camera (light): the size of the largest gap, radians.
     object_centre : (3,) float64
         The point nearest to all optical axes.
+    details : tuple of str
+        How the description was read.
     """
 
     name: str
@@ -76,6 +79,7 @@ class CaptureSummary:
     camera_spread: float | None
     light_spread: float | None
     object_centre: NDArray[np.float64]
+    details: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """The summary as text, one fact a line."""
@@ -92,6 +96,7 @@ class CaptureSummary:
             f"values        {low:.4g} .. {top:.4g}, 99th percentile {high:.4g}, "
             f"{self.n_negative} negative (in {self.n_photographs_read} photographs)",
             f"silhouettes   {self.silhouettes_given} of {self.n_views} given{_coverage(self)}",
+            *(f"read as       {printable(detail)}" for detail in self.details),
         ]
 
 
@@ -144,6 +149,7 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
         camera_spread=largest_gap(views, pole),
         light_spread=largest_gap(np.reshape(lights, (-1, 3)), pole),
         object_centre=centre,
+        details=capture.details,
     )
 
 

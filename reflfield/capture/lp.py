@@ -3,7 +3,8 @@
 Line 1 holds the number of photographs; each further line a file name (which may hold spaces)
 and the direction towards its light: x right, y up in the image, z towards the camera, with
 decimal points or commas. Folders get lost, and paths come from other computers: the longest
-end of a path that names a file beside the description counts.
+end of a path that names a file beside the description counts, else the file of that name in one
+of the folders there.
 
 The directions' frame is taken as the world. Nothing is known of the camera, so it is
 orthographic, its image 1 m wide and centred on the world's origin; the base geometry is the
@@ -16,20 +17,21 @@ from pathlib import Path
 
 import numpy as np
 
-from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import PLANE, Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
+from reflfield.capture.fixed_view import (
+    FixedView,
+    fixed_view_capture,
+    notes_on_lights_behind,
+    orthographic_camera,
+)
 from reflfield.capture.image_files import image_size
 from reflfield.capture.lights import LARGEST_COORDINATE, Light
-from reflfield.capture.names import unique_names
 from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError
-from reflfield.util.quoting import printable, quoted
+from reflfield.util.quoting import quoted
 
 SUFFIX = ".lp"
-IMAGE_WIDTH = 1.0  # metres
-MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearly level
-CAMERA_HEIGHT = 10.0  # metres above the plane; only a sign for an orthographic camera
 
 
 def read_lp(description: Path, *, follow_links: bool = False) -> Capture:
@@ -53,7 +55,7 @@ def read_lp(description: Path, *, follow_links: bool = False) -> Capture:
         If the count and the lines disagree, a line is malformed, a direction is zero, or
         the first photograph is missing.
     """
-    root, files = description.parent, NamedFiles(description, follow_links=follow_links)
+    files = NamedFiles(description, follow_links=follow_links)
     lines = [line.strip() for line in read_text(description).splitlines() if line.strip()]
     if len(lines) < 2 or parse_count(lines[0]) != len(lines) - 1:
         raise CaptureError(
@@ -63,30 +65,38 @@ def read_lp(description: Path, *, follow_links: bool = False) -> Capture:
         )
     check_counts(str(description), 1, len(lines) - 1, len(lines) - 1)
     parsed = [_parsed(line, description) for line in lines[1:]]
-    paths = [files.path_by_last_parts(name) for name, _ in parsed]
+    paths = [_photograph(name, files) for name, _ in parsed]
     for (name, _), path in zip(parsed, paths, strict=True):
         _check_no_more_numbers(name, path, description)
-    names = unique_names(paths, root)
-    notes = _behind([direction for _, direction in parsed], description)
-    lights = tuple(
-        Light(f"l{i:04d}", "directional", direction=np.array(direction))
-        for i, (_, direction) in enumerate(parsed)
-    )
-    return Capture(
-        name=printable(root.resolve().name),
-        root=root,
-        cameras=(_camera(image_size(paths[0])),),
-        lights=lights,
-        photographs=tuple(
-            Photograph(name, 0, i, (Exposure(path),))
-            for i, (name, path) in enumerate(zip(names, paths, strict=True))
-        ),
-        base_geometry=PLANE,
-        up=np.array([0.0, 1.0, 0.0]),
+    lights = [
+        Light("l", "directional", direction=np.array(direction)) for _, direction in parsed
+    ]
+    notes = notes_on_lights_behind([direction for _, direction in parsed], description)
+    return fixed_view_capture(
+        FixedView(tuple(paths), mask=None),
+        lights,
+        files,
+        camera=orthographic_camera(image_size(paths[0])),
         format="lp",
-        description=description,
         notes=notes,
     )
+
+
+def _photograph(name: str, files: NamedFiles) -> Path:
+    """File of a line; where it lacks its folder, in the one folder here that holds it."""
+    path = files.path_by_last_parts(name)
+    if path.is_file():
+        return path
+    last = name.replace("\\", "/").rpartition("/")[2]
+    folders = sorted(folder.name for folder in files.root.iterdir() if folder.is_dir())
+    paths = [files.path(f"{folder}/{last}") for folder in folders if last not in ("", "..")]
+    present = [path for path in paths if path.is_file()]
+    if len(present) > 1:
+        raise CaptureError(
+            f"{files.description}: photograph {quoted(name)}: expected it in one folder, "
+            f"received {present[0]} and {present[1]}; write the folder before the name"
+        )
+    return present[0] if present else path
 
 
 def _check_no_more_numbers(name: str, path: Path, description: Path) -> None:
@@ -98,23 +108,6 @@ def _check_no_more_numbers(name: str, path: Path, description: Path) -> None:
             f"received more numbers in the line of {quoted(name)}; leave the direction alone, "
             "or write capture.json, whose lights have an 'irradiance' each"
         )
-
-
-def _behind(directions: list[list[float]], description: Path) -> tuple[str, ...]:
-    """A note on lights behind the image plane; many of them are of another convention."""
-    behind = sum(direction[2] <= 0 for direction in directions)
-    if behind > MOST_BEHIND * len(directions):
-        raise CaptureError(
-            f"{description}: expected light directions (x right, y up, z towards the camera) "
-            f"in front of the image, z > 0, received {behind} of {len(directions)} others; "
-            "do they have another axis towards the camera, or are they angles?"
-        )
-    if not behind:
-        return ()
-    return (
-        f"{description}: {behind} of {len(directions)} lights are behind the image plane "
-        "(z <= 0); their photographs show nothing of it",
-    )
 
 
 def _parsed(line: str, description: Path) -> tuple[str, list[float]]:
@@ -134,20 +127,3 @@ def _parsed(line: str, description: Path) -> tuple[str, list[float]]:
             f"zero, of at most {LARGEST_COORDINATE:g}, received {numbers}"
         )
     return name, numbers
-
-
-def _camera(size: tuple[int, int]) -> Camera:
-    width, height = size
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[2, 3] = CAMERA_HEIGHT
-    return Camera(
-        id="view",
-        kind="orthographic",
-        width=width,
-        height=height,
-        fl_x=width / IMAGE_WIDTH,
-        fl_y=width / IMAGE_WIDTH,
-        cx=width / 2,
-        cy=height / 2,
-        camera_from_world=pose,
-    )

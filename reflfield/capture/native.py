@@ -176,6 +176,7 @@ def _camera(entry: Mapping[str, Any], description: Path) -> Camera:
             cx=entry["cx"],
             cy=entry["cy"],
             distortion=distortion,
+            skew=entry.get("skew", 0.0),
             camera_from_world=np.array(entry["camera_from_world"], dtype=np.float64),
         )
     except CaptureError as error:

@@ -29,10 +29,14 @@ class NamedFiles:
         Its folder holds the files.
     follow_links : bool
         Whether symbolic links may lead out of the folder.
+    root : Path, optional
+        Folder that holds the files, where it is another one.
     """
 
-    def __init__(self, description: Path, *, follow_links: bool = False) -> None:
-        self.description, self.root = description, description.parent
+    def __init__(
+        self, description: Path, *, follow_links: bool = False, root: Path | None = None
+    ) -> None:
+        self.description, self.root = description, root or description.parent
         self.follow_links = follow_links
         self._resolved_root = self.root.resolve()
         self._listings: dict[Path, dict[str, list[str]]] = {}

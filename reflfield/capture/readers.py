@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
 
-from reflfield.capture import lp, middlebury, native, transforms_json
+from reflfield.capture import btf, middlebury, native, transforms_json
 from reflfield.capture.capture import Capture
+from reflfield.capture.capture_formats import OTHER_READERS, OWN_READERS, READERS, Reader
 from reflfield.capture.consistency import (
     check_environments,
     check_lights,
@@ -19,28 +21,13 @@ from reflfield.capture.consistency import (
 )
 from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.image_files import AS_STATED, ImageReading
+from reflfield.capture.light_table import light_table_of, with_lights
 from reflfield.capture.plausibility import check_code_range, far_lights
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
 from reflfield.util.files import check_regular
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A way to read captures: the files it recognises by name, and how it reads them."""
-
-    pattern: str  # glob, within the capture's folder
-    read: Callable[..., Capture]
-
-
-READERS = {
-    "native": Reader(native.FILE_NAME, native.read_native),
-    "transforms": Reader(transforms_json.FILE_NAME, transforms_json.read_transforms),
-    "middlebury": Reader("*" + middlebury.SUFFIX, middlebury.read_middlebury),
-    "lp": Reader("*" + lp.SUFFIX, lp.read_lp),
-}
 
 
 def open_capture(
@@ -58,8 +45,8 @@ def open_capture(
     ----------
     path : Path or str
         A folder with exactly one description in it, or a description file.
-    format : {"native", "transforms", "middlebury", "lp"}, optional
-        Reader to use; None tells by content.
+    format : str, optional
+        Reader to use, one of `capture_formats.READERS`; None tells by content.
     require_photographs : bool
         Whether every photograph must exist, once per camera and light, in its camera's
         size. False for frames that are only rendered.
@@ -95,6 +82,9 @@ def open_capture(
     else:
         description, kind = path, format or _kind_of_file(path)
     capture = _read(description, kind, follow_links=follow_links, test_split=test_split)
+    table = light_table_of(capture)
+    if table is not None:
+        capture = with_lights(capture, table, follow_links=follow_links)
     capture = capture.read_as(reading)
     check_environments(capture)
     if require_photographs:
@@ -127,30 +117,44 @@ def _read(description: Path, format: str, *, follow_links: bool, test_split: boo
 
 def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
     """The one description in a folder and its format."""
-    descriptions = [
-        (file, name)
-        for name, reader in READERS.items()
-        if format in (None, name)
-        for file in sorted(folder.glob(reader.pattern))
-        if not file.is_dir()
-    ]
+    own = _descriptions(folder, format, OWN_READERS)
     train = folder / transforms_json.TRAIN_NAME
-    if not descriptions and format in (None, "transforms") and train.is_file():
+    if not own and format in (None, "transforms") and train.is_file():
         return train, "transforms"
+    descriptions = own or _descriptions(folder, format, OTHER_READERS)
     if len(descriptions) == 1:
         return descriptions[0]
     for name in (native.FILE_NAME, transforms_json.FILE_NAME):
         other = folder / name
         if not descriptions and (other.is_dir() or other.is_symlink()):
             check_regular(other, CaptureError)  # says what it is
-    wanted = ", ".join(r.pattern for name, r in READERS.items() if format in (None, name))
-    received = ", ".join(file.name for file, _ in descriptions) or "none of them"
+    names = READERS if format is None else (format,)
+    wanted = ", ".join(READERS[name].patterns[0] for name in names)
+    received = ", ".join(str(file.relative_to(folder)) for file, _ in descriptions)
     remedy = "name the file itself" if descriptions else "is this the capture's own folder?"
-    raise CaptureError(f"{folder}: expected one of {wanted}, received {received}; {remedy}")
+    raise CaptureError(
+        f"{folder}: expected one of {wanted}, received {received or 'none of them'}; {remedy}"
+    )
+
+
+def _descriptions(
+    folder: Path, format: str | None, readers: Mapping[str, Reader]
+) -> list[tuple[Path, str]]:
+    return [
+        (file, name)
+        for name, reader in readers.items()
+        if format in (None, name)
+        for file in reader.descriptions(folder)
+    ]
 
 
 def _kind_of_file(path: Path) -> str:
-    """Format of a description file, by what it holds."""
+    """Format of a description file, by its name and by what it holds."""
+    _refuse_btf(path)
+    for name, reader in OTHER_READERS.items():
+        ends = {pattern.rpartition("/")[2] for pattern in reader.patterns}
+        if any(fnmatch(path.name, end) for end in ends) and reader.recognises(path):
+            return name
     text = read_text(path)
     if text.lstrip().startswith("{"):
         document = read_json(path)
@@ -166,6 +170,15 @@ def _kind_of_file(path: Path) -> str:
         if len(words) > 3:
             return "lp"
     raise CaptureError(
-        f"{path}: expected a capture description (capture.json, transforms.json, *_par.txt or "
-        f"*.lp), received {json.dumps(text[:40])}"
+        f"{path}: expected a capture description (capture.json, transforms.json, *_par.txt, "
+        f"*.lp or another of the formats in the README), received {json.dumps(text[:40])}"
     )
+
+
+def _refuse_btf(path: Path) -> None:
+    """Say how a BTF container becomes a capture."""
+    if path.suffix.lower() == btf.SUFFIX:
+        raise CaptureError(
+            f"{path}: expected a capture, received a BTF container; write it as one first, "
+            f"with `reflfield convert {path.name} -o FOLDER`"
+        )

@@ -11,9 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from reflfield.capture.documents import number
 from reflfield.capture.stated_readings import READING_KEYS
 from reflfield.errors import CaptureError
@@ -61,9 +58,6 @@ _REFUSED = tuple(
 )  # fmt: skip
 # Values of refused keys that change nothing.
 _NEUTRAL = (None, False, 0, "", "none")
-# Frames of one camera or light repeat its numbers; beyond this many digits they may differ by
-# the rounding of whatever wrote them.
-SAME_DIGITS = 9
 # Differences between frames in these are differences in values.
 _EXPOSURE = re.compile(
     r"exposure(_time|_value)?|shutter(_speed)?|iso|gain|ev|aperture|f_?number|white_balance"
@@ -92,21 +86,6 @@ class Frame:
         """A number, or the default where there is none."""
         value = self.get(name)
         return default if value is None else number(value, f"{self.what}: {name}")
-
-
-def leading_digits(numbers: NDArray[np.float64]) -> tuple[float | str, ...]:
-    """Equal for numbers that agree in `SAME_DIGITS` digits of the largest of them.
-
-    Examples
-    --------
-    >>> leading_digits(np.array([1e-12, 3.0])) == leading_digits(np.array([0.0, 3.0]))
-    True
-    >>> leading_digits(np.array([1e-12])) == leading_digits(np.array([2e-12]))
-    False
-    """
-    largest = float(np.abs(numbers).max(initial=0.0)) or 1.0
-    rounded = np.round(numbers.ravel() / largest, SAME_DIGITS) + 0.0  # no negative zeros
-    return (f"{largest:.{SAME_DIGITS - 1}e}", *rounded.tolist())
 
 
 def check_keys(common: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:

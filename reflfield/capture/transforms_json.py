@@ -11,10 +11,10 @@ A capture may come as ``transforms_train.json`` with a test split in ``transform
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,14 @@ from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
 from reflfield.capture.documents import check_counts, number_array, read_json
 from reflfield.capture.image_files import ImageReading
-from reflfield.capture.lights import Light
 from reflfield.capture.names import IMAGE_SUFFIXES, unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
 from reflfield.capture.stated_readings import READING_KEYS, stated_reading
 from reflfield.capture.transforms_camera import CAMERA_KEYS, frame_camera, frame_size
-from reflfield.capture.transforms_frame import SPLIT_KEYS, Frame, check_keys, leading_digits
+from reflfield.capture.transforms_frame import SPLIT_KEYS, Frame, check_keys
 from reflfield.capture.transforms_light import LIGHT_KEYS, check_lights, frame_light
+from reflfield.capture.unique_items import UniqueItems, camera_key, numbered
 from reflfield.errors import CaptureError
 from reflfield.util.quoting import printable, quoted
 
@@ -38,31 +38,14 @@ FILE_NAME = "transforms.json"
 TRAIN_NAME = "transforms_train.json"
 TEST_NAMES = ("transforms_test.json", "transforms_val.json", "transforms_valid.json")
 
-Item = TypeVar("Item", Camera, Light)
-
-
-@dataclass
-class _Unique:
-    """Items in order of first appearance, found again by the numbers that define them."""
-
-    index: dict[Hashable, int] = field(default_factory=dict)
-    items: list[Any] = field(default_factory=list)
-
-    def add(self, key: Hashable, item: Item) -> int:
-        """Index of the item with this key."""
-        if key not in self.index:
-            self.index[key] = len(self.items)
-            self.items.append(item)
-        return self.index[key]
-
 
 @dataclass
 class _Reading:
     """What has been read of one or two files: cameras and lights are shared by the splits."""
 
     files: NamedFiles
-    cameras: _Unique = field(default_factory=_Unique)
-    lights: _Unique = field(default_factory=_Unique)
+    cameras: UniqueItems = field(default_factory=UniqueItems)
+    lights: UniqueItems = field(default_factory=UniqueItems)
     silhouettes: dict[int, Path] = field(default_factory=dict)
     other_masks: dict[int, Path] = field(default_factory=dict)
     photographs: list[Photograph] = field(default_factory=list)
@@ -87,7 +70,7 @@ class _Reading:
         said = repr((id(frame.common), size, [frame.own.get(key) for key in CAMERA_KEYS]))
         if said not in self.said:
             camera = frame_camera(frame, path.stem, size)
-            self.said[said] = self.cameras.add(_camera_key(camera), camera)
+            self.said[said] = self.cameras.add(camera_key(camera), camera)
         return self.said[said]
 
     def _light(self, frame: Frame) -> int:
@@ -181,8 +164,8 @@ def _capture(reading: _Reading, document: Mapping[str, Any], description: Path) 
     return Capture(
         name=printable(root.resolve().name),
         root=root,
-        cameras=_named(cameras, "v"),
-        lights=_named(lights, "l"),
+        cameras=numbered(cameras, "v"),
+        lights=numbered(lights, "l"),
         photographs=tuple(
             replace(photograph, name=name)
             for photograph, name in zip(reading.photographs, names, strict=True)
@@ -280,26 +263,6 @@ def _image_path(files: NamedFiles, frame: Frame) -> Path:
     if text.lower().endswith(IMAGE_SUFFIXES):
         return files.path(text)
     return files.path(text, [suffix, *IMAGE_SUFFIXES] if suffix else IMAGE_SUFFIXES)
-
-
-def _camera_key(camera: Camera) -> Hashable:
-    """Equal for cameras that differ by the rounding of whatever wrote them."""
-    inner = np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy])
-    pose = camera.camera_from_world
-    return (
-        camera.kind,
-        camera.width,
-        camera.height,
-        *leading_digits(inner),
-        *camera.distortion,
-        *leading_digits(pose[:3, :3]),
-        *leading_digits(pose[:3, 3]),
-    )
-
-
-def _named(items: list[Item], letter: str) -> tuple[Item, ...]:
-    digits = max(3, len(str(len(items) - 1)))
-    return tuple(replace(item, id=f"{letter}{i:0{digits}d}") for i, item in enumerate(items))
 
 
 def _up(

@@ -7,10 +7,12 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.described_items import described_light
 from reflfield.capture.documents import number_array
 from reflfield.capture.lights import Light
 from reflfield.capture.paths import NamedFiles
-from reflfield.capture.transforms_frame import Frame, leading_digits
+from reflfield.capture.transforms_frame import Frame
+from reflfield.capture.unique_items import leading_digits
 from reflfield.errors import CaptureError
 
 LIGHT_KEYS = ("pl_pos", "pl_intensity", "environment", "environment_convention")
@@ -82,7 +84,7 @@ def frame_light(frame: Frame, files: NamedFiles) -> tuple[Hashable, Light]:
     if frame.get("environment") is not None:
         file = files.path(frame.get("environment"))
         convention = frame.get("environment_convention") or "mitsuba"
-        light = _named(frame, "environment", file=file, convention=convention)
+        light = described_light(frame.what, "environment", file=file, convention=convention)
         return (str(file), convention), light
     if frame.get("pl_pos") is None:
         return "unknown", Light("l", "unknown")
@@ -92,7 +94,7 @@ def frame_light(frame: Frame, files: NamedFiles) -> tuple[Hashable, Light]:
     intensities = _intensities(frame, len(positions))
     key = (*leading_digits(positions), *leading_digits(intensities))
     points = tuple(
-        _named(frame, "point", position=p, intensity=i)
+        described_light(frame.what, "point", position=p, intensity=i)
         for p, i in zip(positions, intensities, strict=True)
     )
     return key, points[0] if len(points) == 1 else Light("l", "group", members=points)
@@ -113,12 +115,3 @@ def _intensities(frame: Frame, n_lights: int) -> NDArray[np.float64]:
             f"{what}: expected {n_lights} rows like pl_pos, received {len(array)}"
         )
     return np.broadcast_to(array, (n_lights, 3))
-
-
-def _named(frame: Frame, kind: str, **fields: object) -> Light:
-    """A light whose errors name the frame."""
-    try:
-        return Light("l", kind, **fields)  # type: ignore[arg-type]
-    except CaptureError as error:
-        text = str(error).removeprefix("light 'l': ")
-        raise CaptureError(f"{frame.what}: light: {text}") from error

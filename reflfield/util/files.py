@@ -7,6 +7,8 @@ never end), sizes are compared with a limit before memory is taken, and nothing 
 from __future__ import annotations
 
 import errno
+import io
+import math
 import os
 import re
 import shutil
@@ -119,6 +121,50 @@ def read_bytes(path: Path, most_bytes: int, error: type[InputError] = InputError
     if len(content) > size:
         raise error(f"{path}: expected {size:,} bytes, but the file grows; is it in use?")
     return content
+
+
+def load_array(
+    path: Path, most_bytes: int, error: type[InputError] = InputError
+) -> NDArray[Any]:
+    """Array of an npy file, whose size is looked at before memory is taken.
+
+    Parameters
+    ----------
+    path : Path
+    most_bytes : int
+        Of the array.
+    error : type, optional
+        What to raise.
+
+    Returns
+    -------
+    ndarray
+        Numbers, booleans or fixed-length text; never Python objects.
+
+    Raises
+    ------
+    InputError
+        Of the type asked for, naming the file, if it is no npy file, damaged, too large or
+        holds pickled objects.
+    """
+    content = io.BytesIO(read_bytes(path, most_bytes + LONGEST_ARRAY_HEADER, error))
+    try:
+        shape, dtype = _array_header(content)
+        claimed = dtype.itemsize * math.prod(shape)
+        if claimed != len(content.getvalue()) - content.tell():
+            raise ValueError(f"an array of {claimed:,} bytes in a file of another size")
+        content.seek(0)
+        array: NDArray[Any] = np.lib.format.read_array(
+            content, allow_pickle=False, max_header_size=LONGEST_ARRAY_HEADER
+        )
+    except (OSError, ValueError, KeyError, EOFError, SyntaxError, TypeError, MemoryError,
+            OverflowError, RecursionError) as failure:  # fmt: skip
+        text = " ".join(str(failure).split()) or type(failure).__name__
+        raise error(
+            f"{path}: expected an array in an npy file, received a damaged, truncated or "
+            f"different file ({text}); copy or make it again"
+        ) from failure
+    return array
 
 
 def load_arrays(

@@ -412,8 +412,8 @@ class TestDetection:
             open_capture(tmp_path / "gone")
 
     def test_unknown_format(self, tmp_path):
-        with pytest.raises(CaptureError, match=r"format.*'colmap'"):
-            open_capture(tmp_path, "colmap")
+        with pytest.raises(CaptureError, match=r"format.*'tables'"):
+            open_capture(tmp_path, "tables")
 
     @pytest.mark.parametrize(
         ("content", "reason"),
