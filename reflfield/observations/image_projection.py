@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
-from reflfield.capture.clipping import BLACK
+from reflfield.capture.clipping import SATURATED, with_bounded_black
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.observations.store import (
@@ -37,10 +37,6 @@ NOT_MEASURED = ("saturated", "transparent", "dark")
 # Those that do: black is less than the file can say.
 IS_KNOWN = np.array([kind in ("measured", "black") for kind in VALUE_KINDS])
 IS_GAP = np.array([kind in NOT_MEASURED for kind in VALUE_KINDS])
-# Code 0 is a measurement: it says that the value is less than half of the least code. Numbers
-# spread evenly up to there have cube roots of three quarters of the largest on average, known
-# to a fifth: with the smallest value of the photograph for the least code, this share of it.
-BLACK_SHARE = 0.75**3 / 2
 # A pixel of less weight in a bilinear sample changes it by less than a half float's rounding
 # of eleven bits: what such a pixel is does not matter.
 LEAST_WEIGHT = 2.0**-11
@@ -206,6 +202,8 @@ class Projected:
         True where some camera measured a value under the light.
     brightest, darkest : float
         Largest and smallest sample, 1/sr; 0 where all is dark, where nothing is negative.
+    peaks : (n_views, n_lights) float32
+        Largest value of each photograph, on the object or off it; 0 where there is none.
     looked_into : LookedInto
         Some of the samples.
     """
@@ -215,6 +213,7 @@ class Projected:
     measured: NDArray[np.bool_]
     brightest: float
     darkest: float
+    peaks: Floats
     looked_into: LookedInto
 
     def count(self, kind: str) -> int:
@@ -262,17 +261,19 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         intact=has_views,
         at_once=at_once,
     )
-    n_photographs, values, brightest, darkest = 0, [], 0.0, 0.0
+    n_photographs, values, peaks, brightest, darkest = 0, [], [], 0.0, 0.0
     measured = np.zeros((projection.shape[0], -(-projection.shape[2] // 8)), np.uint8)
     for part in parts:
         n_photographs += int(part["photographs"])
         values.append(part["values"])
+        peaks.append(part["peaks"])
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
         darkest = min(darkest, float(part["darkest"]))
     bits = np.unpackbits(measured, axis=1, count=projection.shape[2]).astype(np.bool_)
     projected = Projected(
-        n_photographs, np.concatenate(values), bits, brightest, darkest, first
+        *(n_photographs, np.concatenate(values), bits, brightest, darkest),
+        *(np.concatenate(peaks), first),
     )
     n_gaps = sum(projected.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(projected.values.sum()), 1))
@@ -289,9 +290,10 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
     n_read, brightest, darkest = 0, 0.0, 0.0
+    peaks = np.zeros((len(views), n_lights), np.float32)
     for i, view in enumerate(views):
         seen = np.flatnonzero(projection.visible[:, view])
-        for lights, values, kinds in _view_samples(
+        for lights, (values, kinds, peaks[i, lights]) in _view_samples(
             projection.capture, view, points[seen], projection.budget
         ):
             stored = np.clip(values / np.float32(unit), -HALF_MAX, HALF_MAX)
@@ -308,6 +310,7 @@ def project_views(projection: Projection, views: range) -> dict[str, NDArray[Any
         "measured": np.packbits(measured, axis=1),
         "brightest": np.array(brightest),
         "darkest": np.array(darkest),
+        "peaks": peaks,
     }
 
 
@@ -340,7 +343,7 @@ def look_into(projection: Projection) -> LookedInto:
 
 
 def samples_of_photograph(
-    capture: Capture, index: int, positions: NDArray[np.floating]
+    capture: Capture, index: int, positions: NDArray[np.floating], *, bounds: bool = False
 ) -> tuple[Floats, Kinds]:
     """Samples of one photograph at points that its camera sees.
 
@@ -351,6 +354,8 @@ def samples_of_photograph(
         Of the photograph.
     positions : (n, 3) float
         Metres, world frame.
+    bounds : bool
+        Whether saturated values are returned as well, which are bounds from below.
 
     Returns
     -------
@@ -363,7 +368,9 @@ def samples_of_photograph(
     points = np.asarray(positions, np.float64)
     pixels, _ = capture.cameras[photograph.camera].project(points)
     lights = np.array([photograph.light])
-    values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
+    values, kinds, _ = _samples_at(
+        capture, photograph.camera, lights, points, pixels, bounds=bounds
+    )
     return values[:, 0], kinds[:, 0]
 
 
@@ -383,8 +390,8 @@ def sample_unit(looked_into: LookedInto) -> float:
 
 def _view_samples(
     capture: Capture, view: int, points: NDArray[np.float64], budget: int
-) -> Iterator[tuple[NDArray[np.intp], Floats, Kinds]]:
-    """Samples and kinds (n_points, n, 3) of one view, some lights at a time."""
+) -> Iterator[tuple[NDArray[np.intp], tuple[Floats, Kinds, Floats]]]:
+    """Samples and kinds (n_points, n, 3), and peaks, of one view, some lights at a time."""
     pixels, _ = capture.cameras[view].project(points)
     photographed = np.flatnonzero(capture.photograph_index[view] >= 0)
     camera = capture.cameras[view]
@@ -393,7 +400,7 @@ def _view_samples(
     together = int(np.clip(budget // max(each, 1), 1, LIGHTS_AT_ONCE))
     for lights in np.array_split(photographed, max(1, -(-len(photographed) // together))):
         if len(lights):
-            yield lights, *_samples_at(capture, view, lights, points, pixels)
+            yield lights, _samples_at(capture, view, lights, points, pixels)
 
 
 def _samples_at(
@@ -402,8 +409,10 @@ def _samples_at(
     lights: NDArray[np.intp],
     points: NDArray[np.float64],
     pixels: NDArray[np.float64],
-) -> tuple[Floats, Kinds]:
-    """Samples of one view at the pixels of points, and of what kind each value is."""
+    *,
+    bounds: bool = False,
+) -> tuple[Floats, Kinds, Floats]:
+    """Samples of one view at the pixels of points, their kinds, and the photographs' peaks."""
     indices = capture.photograph_index[view, lights]
     camera = capture.cameras[view]
     images = np.zeros((len(lights), camera.height, camera.width, 3), np.float32)
@@ -414,6 +423,7 @@ def _samples_at(
             image = with_bounded_black(image, of_pixels)
             _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
         images[j] = image
+    peaks = images.max(axis=(1, 2, 3))
     irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
     # A light may have no blue, a spot may miss a texel: nothing is learned there.
     lit = irradiance > 0
@@ -425,26 +435,11 @@ def _samples_at(
     # What lies outside a spot's cone follows from the light alone, and stays black.
     values[unlit] = 0.0
     if kinds.any():
-        values[IS_GAP[kinds]] = np.nan
-    return values, kinds
-
-
-def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
-    """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
-
-    Examples
-    --------
-    >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
-    >>> kinds = np.where(image > 0, 0, BLACK)
-    >>> with_bounded_black(image, kinds)[0, 0].round(3)
-    array([0.105, 0.021, 0.211], dtype=float32)
-    """
-    black = kinds == BLACK
-    if not black.any():
-        return image
-    positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)
-    darkest = np.where(np.isfinite(positive), positive, 0.0)
-    return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
+        gaps = IS_GAP[kinds]
+        if bounds:
+            gaps &= kinds != SATURATED
+        values[gaps] = np.nan
+    return values, kinds, peaks
 
 
 @numba.njit(cache=True, nogil=True)
