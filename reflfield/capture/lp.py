@@ -12,6 +12,7 @@ image plane.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,9 @@ from reflfield.util.quoting import printable, quoted
 
 SUFFIX = ".lp"
 IMAGE_WIDTH = 1.0  # metres
+# Lights all lower than this (a sine) over the image plane light nothing evenly: their numbers
+# mean something else.
+LOWEST = 0.05
 MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearly level
 CAMERA_HEIGHT = 10.0  # metres above the plane; only a sign for an orthographic camera
 
@@ -108,6 +112,13 @@ def _behind(directions: list[list[float]], description: Path) -> tuple[str, ...]
             f"{description}: expected light directions (x right, y up, z towards the camera) "
             f"in front of the image, z > 0, received {behind} of {len(directions)} others; "
             "do they have another axis towards the camera, or are they angles?"
+        )
+    heights = [direction[2] / math.hypot(*direction) for direction in directions]
+    if len(heights) > 1 and max(heights) < LOWEST:
+        raise CaptureError(
+            f"{description}: expected light directions x y z, z towards the camera, received "
+            f"{len(directions)} that are all within {math.degrees(math.asin(LOWEST)):.0f} "
+            "degrees of the image plane; are they angles?"
         )
     if not behind:
         return ()
