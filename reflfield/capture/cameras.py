@@ -39,6 +39,8 @@ LONGEST_SIDE, MOST_PIXELS = 65_535, 2**29
 # Of focal lengths, principal points, coefficients and positions; their products and squares
 # stay finite.
 LARGEST_NUMBER = 1e12
+# Sides of an image in focal lengths, at most: an angle of view of 178 degrees.
+WIDEST = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +71,8 @@ class Camera:
     ------
     CaptureError
         If a size or focal length is not positive or beyond its range (`LONGEST_SIDE`,
-        `MOST_PIXELS`, `LARGEST_NUMBER`), a number is not finite, or `camera_from_world` is
-        not a rigid motion. The message names the camera.
+        `MOST_PIXELS`, `LARGEST_NUMBER`, `WIDEST`), a number is not finite, or
+        `camera_from_world` is not a rigid motion. The message names the camera.
 
     Examples
     --------
@@ -433,6 +435,13 @@ def _check_intrinsics(camera: Camera) -> None:
         raise CaptureError(
             f"camera {camera.id!r}: camera matrix is singular or mirrored: expected fl_x and "
             f"fl_y > 0, received {camera.fl_x} and {camera.fl_y}"
+        )
+    least = camera.width / WIDEST, camera.height / WIDEST
+    if camera.kind == OPENCV and (camera.fl_x < least[0] or camera.fl_y < least[1]):
+        raise CaptureError(
+            f"camera {camera.id!r}: expected fl_x and fl_y in pixels, of at least {least[0]:g} "
+            f"and {least[1]:g} for images of {camera.width} x {camera.height}, received "
+            f"{camera.fl_x} and {camera.fl_y}; are they millimetres, or shares of the image?"
         )
     _check_fisheye(camera)
 

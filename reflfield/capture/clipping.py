@@ -41,6 +41,11 @@ USUAL_CODES = tuple(
     code / 65535 for k in (10, 12, 14) for code in (2**k - 1, (2**k - 1) << (16 - k))
 )
 
+# Code 0 is a measurement: it says that the value is less than half of the least code. Numbers
+# spread evenly up to there have cube roots of three quarters of the largest on average, known
+# to a fifth: with the smallest value of the photograph for the least code, this share of it.
+BLACK_SHARE = 0.75**3 / 2
+
 
 def kinds_of_stored(
     stored: Float32, *, integer: bool, white_level: float | None = None
@@ -95,6 +100,24 @@ def kinds_of_bracket(shots: Sequence[Kinds], seconds: Sequence[float]) -> Kinds:
     unmeasured[(unmeasured == SATURATED) & (shortest != SATURATED)] = BLACK
     measured = np.logical_or.reduce([kinds == MEASURED for kinds in shots])
     return np.where(measured, np.uint8(MEASURED), unmeasured)
+
+
+def with_bounded_black(image: Float32, kinds: Kinds) -> Float32:
+    """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
+
+    Examples
+    --------
+    >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
+    >>> kinds = np.where(image > 0, 0, BLACK)
+    >>> with_bounded_black(image, kinds)[0, 0].round(3)
+    array([0.105, 0.021, 0.211], dtype=float32)
+    """
+    black = kinds == BLACK
+    if not black.any():
+        return image
+    positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)
+    darkest = np.where(np.isfinite(positive), positive, 0.0)
+    return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
 
 
 def _upper_limit(channel: Float32, integer: bool) -> float:

@@ -93,8 +93,8 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises
     ------
     CaptureError
-        If the file cannot be read, is not JSON, not an object or too large, or holds NaN,
-        infinities or numbers beyond double precision.
+        If the file cannot be read, is not JSON, not an object or too large, holds NaN,
+        infinities or numbers beyond double precision, or gives a key two values.
     """
     text = read_text(path)
     n_objects, n_values = text.count("{"), text.count(",") + text.count("[") + text.count(":")
@@ -110,6 +110,7 @@ def read_json(path: Path) -> dict[str, Any]:
             parse_constant=_refuse_constant,
             parse_float=_finite_float,
             parse_int=_finite_int,
+            object_pairs_hook=_object,
         )
     except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: expected JSON, received {error}") from error
@@ -118,6 +119,16 @@ def read_json(path: Path) -> dict[str, Any]:
             f"{path}: expected a JSON object, received {type(document).__name__}"
         )
     return document
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Object of its pairs; one key with two values is refused."""
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        for name, value in pairs:
+            if content[name] != value:
+                raise ValueError(f"two values of the key {quoted(name)} in one object")
+    return content
 
 
 def parse_number(text: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,9 @@ from reflfield.util.quoting import listed, printable
 
 IMAGE_WIDTH = 1.0  # metres
 CAMERA_HEIGHT = 10.0  # metres above the plane; only a sign for an orthographic camera
+# Lights all lower than this (a sine) over the image plane light nothing evenly: their numbers
+# mean something else.
+LOWEST = 0.05
 MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearly level
 # Words of files that lie beside photographs and are none.
 _OTHER_IMAGES = re.compile(r"mask|normals?|gt|ref|depth|albedo|dark|ambient|preview|thumb")
@@ -125,7 +129,7 @@ def notes_on_lights_behind(
     Raises
     ------
     CaptureError
-        If they are more than `MOST_BEHIND` of all.
+        If they are more than `MOST_BEHIND` of all, or all are in the image plane.
     """
     behind = sum(direction[2] <= 0 for direction in directions)
     if behind > MOST_BEHIND * len(directions):
@@ -133,6 +137,13 @@ def notes_on_lights_behind(
             f"{description}: expected light directions (x right, y up, z towards the camera) "
             f"in front of the image, z > 0, received {behind} of {len(directions)} others; "
             "do they have another axis towards the camera, or are they angles?"
+        )
+    heights = [direction[2] / math.hypot(*direction) for direction in directions]
+    if len(heights) > 1 and max(heights) < LOWEST:
+        raise CaptureError(
+            f"{description}: expected light directions x y z, z towards the camera, received "
+            f"{len(directions)} that are all within {math.degrees(math.asin(LOWEST)):.0f} "
+            "degrees of the image plane; are they angles?"
         )
     if not behind:
         return ()

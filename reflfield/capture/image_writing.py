@@ -40,7 +40,7 @@ def write_exr(
     """
     stack = image[..., None] if image.ndim == 2 else image
     if stack.dtype != np.float16:
-        stack = stack.astype(np.float32)
+        stack = stack.astype(np.float32, copy=False)
     names = list(names) if names is not None else _default_names(stack.shape[-1])
     if stack.ndim != 3 or len(names) != stack.shape[2]:
         raise ShapeError(

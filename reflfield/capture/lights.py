@@ -31,7 +31,7 @@ CONVENTIONS = ("openexr", "mitsuba", "blender")
 
 # Largest coordinate and largest intensity, in whatever units: what follows from them (squares
 # of distances, irradiances) stays finite in single precision.
-LARGEST_COORDINATE, LARGEST_INTENSITY = 1e12, 1e18
+LARGEST_COORDINATE, LARGEST_INTENSITY, LEAST_INTENSITY = 1e12, 1e18, 1e-30
 
 # Two lights closer than this would be one light; it also keeps 1/d^2 finite.
 SMALLEST_DISTANCE = 1e-9
@@ -82,7 +82,7 @@ class Light:
     ------
     CaptureError
         If a number is not finite or beyond its range (`LARGEST_COORDINATE`,
-        `LARGEST_INTENSITY`), an intensity negative, a direction zero.
+        `LARGEST_INTENSITY`, `LEAST_INTENSITY`), an intensity negative, a direction zero.
 
     Examples
     --------
@@ -268,6 +268,11 @@ def _vector(light: Light, name: str) -> Array:
         raise CaptureError(
             f"light {light.id!r}: {name}: expected numbers of at most {largest:g}, received "
             f"{vector.tolist()}; choose another unit"
+        )
+    if name == "intensity" and 0 < np.abs(vector).max() < LEAST_INTENSITY:
+        raise CaptureError(
+            f"light {light.id!r}: intensity: expected one of at least {LEAST_INTENSITY:g} in "
+            f"some channel, or none, received {vector.tolist()}; choose another unit"
         )
     vector.setflags(write=False)
     return vector

@@ -10,6 +10,7 @@ from reflfield.capture.image_files import largest_code_of_16
 from reflfield.capture.inspect import object_centre, spread_evenly
 from reflfield.capture.lights import POINT, SPOT
 from reflfield.errors import CaptureError
+from reflfield.util.quoting import listed
 
 # 16-bit files that hold sensors' codes as they are have at most 12 bits set, one in sixteen of
 # the range; encoded photographs reach that in any that is not nearly black.
@@ -18,6 +19,8 @@ TWELVE_BITS = 4095
 _MOST_LOOKED_INTO = 8
 # A dome's lamps stand about as far from the object as its cameras.
 FARTHEST_LIGHTS = 100.0
+# Pixels of today's sensors are square.
+LARGEST_ASPECT = 1.5
 
 
 def check_code_range(capture: Capture) -> None:
@@ -64,4 +67,20 @@ def far_lights(capture: Capture) -> tuple[str, ...]:
         f"{capture.description}: lights are {far / near:.3g} times as far from what the "
         f"cameras look at as these are (medians {far:.3g} and {near:.3g}); are both in one "
         "unit?",
+    )
+
+
+def oblong_pixels(capture: Capture) -> tuple[str, ...]:
+    """A note on cameras whose focal lengths in pixels differ much between the axes."""
+    oblong = [
+        camera
+        for camera in capture.cameras
+        if max(camera.fl_x, camera.fl_y) > LARGEST_ASPECT * min(camera.fl_x, camera.fl_y)
+    ]
+    if not oblong:
+        return ()
+    return (
+        f"{capture.description}: fl_x and fl_y differ as if pixels were oblong in "
+        f"{listed([camera.id for camera in oblong])} ({oblong[0].fl_x:.6g} and "
+        f"{oblong[0].fl_y:.6g}); is that so?",
     )

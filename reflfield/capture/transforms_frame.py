@@ -44,6 +44,8 @@ _REFUSED = tuple(
         (r"dist(ortion)?(_(params|coeffs?|coefficients))?|(radial|tangential)_distortion",
          "name the coefficients k1, k2, p1, p2, k3"),
         (r"latlong|equirectangular|panorama|(is_)?orthographic", _UNDISTORT),
+        (r"camera_type|projection(_type)?", _UNDISTORT),
+        (r"gamma|colou?r_?space|transfer_function", "say how files are encoded in 'encoding'"),
         (r"[xy]_fov|fov(_[xy])?|fov[xy]", "give 'camera_angle_x' in radians, or 'fl_x'"),
         (r"f[xy]|focal(_length)?(_[xy])?", "give 'fl_x' and 'fl_y' in pixels"),
         (r"rolling_shutter\w*|transform_matrix_(start|end)|camera_\w+_velocity",
@@ -57,7 +59,7 @@ _REFUSED = tuple(
     )
 )  # fmt: skip
 # Values of refused keys that change nothing.
-_NEUTRAL = (None, False, 0, "", "none")
+_NEUTRAL = (None, False, 0, "", "none", "perspective", "pinhole", "srgb")
 # Differences between frames in these are differences in values.
 _EXPOSURE = re.compile(
     r"exposure(_time|_value)?|shutter(_speed)?|iso|gain|ev|aperture|f_?number|white_balance"
@@ -139,7 +141,8 @@ def _refuse(key: str, remedy: str, frames: Sequence[Frame]) -> None:
 def _is_neutral(value: Any) -> bool:
     if isinstance(value, list):
         return all(_is_neutral(item) for item in value[:100]) and len(value) <= 100
-    return not isinstance(value, dict) and value in _NEUTRAL
+    plain = value.lower() if isinstance(value, str) else value
+    return not isinstance(plain, dict) and plain in _NEUTRAL
 
 
 def _check_same(key: str, frames: Sequence[Frame]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.errors import GeometryError
 from reflfield.geometry.carving import refuse_empty
 from reflfield.geometry.cones import View, normalised
@@ -20,6 +21,9 @@ _N_TANGENTS = 16
 
 # Boxes so many times larger than the median are those of views that hardly meet.
 _OVERSIZE = 4.0
+
+# Cameras that differ by less, relative to their coordinates, differ by rounding.
+_ONE_PLACE = 1e-12
 
 
 def object_bounds(views: Sequence[View], tolerance: int) -> tuple[Array, Array]:
@@ -84,6 +88,7 @@ def _whereabouts(views: Sequence[View]) -> tuple[Array, float]:
 
     The box is sought in these units, in which the solver's tolerances make sense.
     """
+    _check_places(views)
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         middle = 0.5 * (view.outline.outline.min(axis=0) + view.outline.outline.max(axis=0))
@@ -97,10 +102,24 @@ def _whereabouts(views: Sequence[View]) -> tuple[Array, float]:
     return centre, float(np.median(sizes))
 
 
+def _check_places(views: Sequence[View]) -> None:
+    """Refuse cameras that all stand at one place: only the place itself is in all cones."""
+    centres = np.array(
+        [view.camera.centre for view in views if view.camera.kind != ORTHOGRAPHIC]
+    )
+    if len(centres) != len(views) or len(views) < 2:
+        return
+    if np.ptp(centres, axis=0).max() <= _ONE_PLACE * np.abs(centres).max():
+        raise GeometryError(
+            f"cameras: expected views from several places, received {len(views)} that all "
+            f"stand at {np.round(centres[0], 4).tolist()}; give the translations of their poses"
+        )
+
+
 def _size_at(view: View, centre: Array) -> float:
     """Length that the silhouette's larger side has at the depth of a point, metres."""
     extent = np.ptp(view.outline.outline, axis=0).max() + 1.0
-    if view.camera.kind == "orthographic":
+    if view.camera.kind == ORTHOGRAPHIC:
         return float(extent / view.camera.fl_x)
     # A point in the camera itself would give size zero.
     distance = max(np.linalg.norm(view.camera.centre - centre), np.finfo(np.float64).tiny)
@@ -146,7 +165,7 @@ def _half_spaces(view: View, origin: Array, scale: float) -> tuple[Array, Array]
     bounded = rim_reach < reach - 2.0 * pixel
     tangents, reach = tangents[bounded], reach[bounded]
     rotation, shift = camera.rotation, camera.camera_from_world[:3, 3]
-    if camera.kind == "orthographic":
+    if camera.kind == ORTHOGRAPHIC:
         normals = tangents @ rotation[:2]
         offsets = reach - tangents @ shift[:2]
     else:

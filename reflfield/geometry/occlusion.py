@@ -6,6 +6,7 @@ Near cameras and near lights are points: every texel has its own ray to them.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -223,6 +224,26 @@ def check_light_outside(scene: RayScene, light: Light) -> None:
             f"{np.round(light.position, 4).tolist()} inside its hull; check the light's "
             "position, its units (metres) and its frame"
         )
+
+
+def cameras_inside(scene: RayScene, cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """Names of the cameras that stand inside the object.
+
+    Raises
+    ------
+    InputError
+        If all do.
+    """
+    standing = [camera for camera in cameras if camera.kind != "orthographic"]
+    inside = scene.inside(np.array([camera.centre for camera in standing]).reshape(-1, 3))
+    if len(cameras) and inside.sum() == len(cameras):
+        raise InputError(
+            f"cameras: expected positions outside the object, received {len(cameras)} that are "
+            f"all inside its hull, such as {standing[0].id!r} at "
+            f"{np.round(standing[0].centre, 4).tolist()}; check the poses, their units and "
+            "whether they are camera-to-world"
+        )
+    return tuple(camera.id for camera, within in zip(standing, inside, strict=True) if within)
 
 
 def _faces_camera(texels: TexelTable, camera: Camera, options: VisibilityOptions) -> Bools:

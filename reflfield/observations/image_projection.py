@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
-from reflfield.capture.clipping import BLACK
+from reflfield.capture.clipping import SATURATED, with_bounded_black
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.observations.photographed_pairs import PhotographedPairs
@@ -39,10 +39,6 @@ NOT_MEASURED = ("saturated", "transparent", "dark")
 # Those that do: black is less than the file can say.
 IS_KNOWN = np.array([kind in ("measured", "black") for kind in VALUE_KINDS])
 IS_GAP = np.array([kind in NOT_MEASURED for kind in VALUE_KINDS])
-# Code 0 is a measurement: it says that the value is less than half of the least code. Numbers
-# spread evenly up to there have cube roots of three quarters of the largest on average, known
-# to a fifth: with the smallest value of the photograph for the least code, this share of it.
-BLACK_SHARE = 0.75**3 / 2
 # A pixel of less weight in a bilinear sample changes it by less than a half float's rounding
 # of eleven bits: what such a pixel is does not matter.
 LEAST_WEIGHT = 2.0**-11
@@ -207,6 +203,8 @@ class Projected:
         True where some camera measured a value under the light.
     brightest, darkest : float
         Largest and smallest sample, 1/sr; 0 where all is dark, where nothing is negative.
+    peaks : (n_views, n_lights) float32
+        Largest value of each photograph, on the object or off it; 0 where there is none.
     looked_into : LookedInto
         Some of the samples.
     """
@@ -216,6 +214,7 @@ class Projected:
     measured: NDArray[np.bool_]
     brightest: float
     darkest: float
+    peaks: Floats
     looked_into: LookedInto
 
     def count(self, kind: str) -> int:
@@ -264,17 +263,23 @@ def project_photographs(projection: Projection, blocks: Blocks, at_once: int = 1
         intact=has_chunk,
         at_once=at_once,
     )
-    n_photographs, brightest, darkest = 0, 0.0, 0.0
+    n_photographs, peaks, brightest, darkest = 0, [], 0.0, 0.0
     values = np.zeros((pairs.n_views, len(VALUE_KINDS)), np.int64)
     measured = np.zeros((n_texels, -(-pairs.n_lights // 8)), np.uint8)
     for part in parts:
         n_photographs += int(part["photographs"])
         values[part["views"]] += part["values"]
+        peaks.append(part["peaks"])
         measured |= part["measured"]
         brightest = max(brightest, float(part["brightest"]))
         darkest = min(darkest, float(part["darkest"]))
     bits = np.unpackbits(measured, axis=1, count=pairs.n_lights).astype(np.bool_)
-    projected = Projected(n_photographs, values, bits, brightest, darkest, first)
+    of_photographs = np.zeros((pairs.n_views, pairs.n_lights), np.float32)
+    of_photographs[pairs.view, pairs.light] = np.concatenate(peaks)
+    projected = Projected(
+        *(n_photographs, values, bits, brightest, darkest),
+        *(of_photographs, first),
+    )
     n_gaps = sum(projected.count(kind) for kind in NOT_MEASURED)
     note_gaps(projection.location, n_gaps / max(int(projected.values.sum()), 1))
     return projected
@@ -293,16 +298,17 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
     measured = np.zeros((len(points), projection.pairs.n_lights), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
-    brightest, darkest = 0.0, 0.0
+    peaks, brightest, darkest = np.zeros(len(photographs), np.float32), 0.0, 0.0
     for i, (view, first, end) in enumerate(
         zip(of_block, starts, np.append(starts[1:], len(views)), strict=True)
     ):
         seen = np.flatnonzero(projection.visible[:, view])
-        for some, values, kinds in _view_samples(
+        for some, (values, kinds, brightest_pixels) in _view_samples(
             projection.capture, int(view), lights[first:end], points[seen], projection.budget
         ):
             stored = np.clip(values / np.float32(unit), -HALF_MAX, HALF_MAX)
             block[seen[:, None], first + some] = stored.astype(np.float16)
+            peaks[first + some] = brightest_pixels
             counts[i] += _counts_of(kinds)
             measured[seen[:, None], lights[first + some]] |= IS_KNOWN[kinds].any(axis=2)
             brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
@@ -315,6 +321,7 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
         "measured": np.packbits(measured, axis=1),
         "brightest": np.array(brightest),
         "darkest": np.array(darkest),
+        "peaks": peaks,
     }
 
 
@@ -347,7 +354,7 @@ def look_into(projection: Projection) -> LookedInto:
 
 
 def samples_of_photograph(
-    capture: Capture, index: int, positions: NDArray[np.floating]
+    capture: Capture, index: int, positions: NDArray[np.floating], *, bounds: bool = False
 ) -> tuple[Floats, Kinds]:
     """Samples of one photograph at points that its camera sees.
 
@@ -358,6 +365,8 @@ def samples_of_photograph(
         Of the photograph.
     positions : (n, 3) float
         Metres, world frame.
+    bounds : bool
+        Whether saturated values are returned as well, which are bounds from below.
 
     Returns
     -------
@@ -370,7 +379,9 @@ def samples_of_photograph(
     points = np.asarray(positions, np.float64)
     pixels, _ = capture.cameras[photograph.camera].project(points)
     lights = np.array([photograph.light])
-    values, kinds = _samples_at(capture, photograph.camera, lights, points, pixels)
+    values, kinds, _ = _samples_at(
+        capture, photograph.camera, lights, points, pixels, bounds=bounds
+    )
     return values[:, 0], kinds[:, 0]
 
 
@@ -394,15 +405,15 @@ def _view_samples(
     lights: NDArray[np.intp],
     points: NDArray[np.float64],
     budget: int,
-) -> Iterator[tuple[NDArray[np.intp], Floats, Kinds]]:
-    """Places of some lights at a time, with samples and kinds (n_points, n, 3) of a view."""
+) -> Iterator[tuple[NDArray[np.intp], tuple[Floats, Kinds, Floats]]]:
+    """Places of some lights at a time, with samples, kinds (n_points, n, 3) and peaks."""
     pixels, _ = capture.cameras[view].project(points)
     camera = capture.cameras[view]
     # A photograph with the copies made of it while reading, and its samples.
     each = 12 * (3 * camera.width * camera.height + 4 * len(points))
     together = int(np.clip(budget // max(each, 1), 1, LIGHTS_AT_ONCE))
     for some in np.array_split(np.arange(len(lights)), -(-len(lights) // together)):
-        yield some, *_samples_at(capture, view, lights[some], points, pixels)
+        yield some, _samples_at(capture, view, lights[some], points, pixels)
 
 
 def _samples_at(
@@ -411,8 +422,10 @@ def _samples_at(
     lights: NDArray[np.intp],
     points: NDArray[np.float64],
     pixels: NDArray[np.float64],
-) -> tuple[Floats, Kinds]:
-    """Samples of one view at the pixels of points, and of what kind each value is."""
+    *,
+    bounds: bool = False,
+) -> tuple[Floats, Kinds, Floats]:
+    """Samples of one view at the pixels of points, their kinds, and the photographs' peaks."""
     indices = capture.photograph_index[view, lights]
     camera = capture.cameras[view]
     images = np.zeros((len(lights), camera.height, camera.width, 3), np.float32)
@@ -423,6 +436,7 @@ def _samples_at(
             image = with_bounded_black(image, of_pixels)
             _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
         images[j] = image
+    peaks = images.max(axis=(1, 2, 3))
     irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
     # A light may have no blue, a spot may miss a texel: nothing is learned there.
     lit = irradiance > 0
@@ -434,26 +448,11 @@ def _samples_at(
     # What lies outside a spot's cone follows from the light alone, and stays black.
     values[unlit] = 0.0
     if kinds.any():
-        values[IS_GAP[kinds]] = np.nan
-    return values, kinds
-
-
-def with_bounded_black(image: Floats, kinds: Kinds) -> Floats:
-    """Photograph (h, w, 3) with `BLACK_SHARE` of its darkest values where it is at code 0.
-
-    Examples
-    --------
-    >>> image = np.array([[[0.0, 0.0, 0.0], [0.5, 0.1, 1.0]]], np.float32)
-    >>> kinds = np.where(image > 0, 0, BLACK)
-    >>> with_bounded_black(image, kinds)[0, 0].round(3)
-    array([0.105, 0.021, 0.211], dtype=float32)
-    """
-    black = kinds == BLACK
-    if not black.any():
-        return image
-    positive = image.min(axis=(0, 1), where=image > 0, initial=np.inf)
-    darkest = np.where(np.isfinite(positive), positive, 0.0)
-    return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
+        gaps = IS_GAP[kinds]
+        if bounds:
+            gaps &= kinds != SATURATED
+        values[gaps] = np.nan
+    return values, kinds, peaks
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,6 +20,8 @@ MEASURED = "measured.npz"
 TRACE = 1e-3
 # Noise about a black that was subtracted goes below 0, but not by this share of the brightest.
 NEGATIVE = 0.1
+# A backdrop, or a lamp in view, is brighter than the object, but not by this factor.
+ABSURD = 1e9
 # What is told of, and the remedy. Not of black: an object has sides that no light reaches.
 TOLD = {
     "saturated": "saturated, known only to be at least as bright; expose shorter, or bracket",
@@ -73,6 +75,7 @@ def clipping_lines(capture: Capture, projected: Projected) -> Iterator[str]:
             f"{projected.darkest / projected.brightest:.0%} of the brightest; check that the "
             "files, or their layers, are photographs, and what was subtracted from them"
         )
+    yield from absurd_lines(capture, projected)
     seen = np.maximum(projected.values.sum(axis=1), 1)
     for kind, text in TOLD.items():
         counts = projected.values[:, VALUE_KINDS.index(kind)]
@@ -83,6 +86,22 @@ def clipping_lines(capture: Capture, projected: Projected) -> Iterator[str]:
                 f"{text} (most, {counts[worst] / seen[worst]:.1%}, of camera "
                 f"{capture.cameras[worst].id!r})"
             )
+
+
+def absurd_lines(capture: Capture, projected: Projected) -> Iterator[str]:
+    """Say of pixels so bright that the file must be damaged, and in which photograph."""
+    if not (projected.peaks > 0).any():
+        return
+    usual = float(np.quantile(projected.peaks[projected.peaks > 0], 0.5, method="lower"))
+    view, light = np.unravel_index(np.argmax(projected.peaks), projected.peaks.shape)
+    peak = float(projected.peaks[view, light])
+    if peak > ABSURD * usual:
+        name = capture.photographs[int(capture.photograph_index[view, light])].name
+        yield (
+            f"photographs: {name!r} has values up to {peak:.3g}, {peak / usual:.0e} times the "
+            "brightest of other photographs; is the file damaged? Off the object they are not "
+            "used"
+        )
 
 
 def write_measured(folder: Path, measured: Bools) -> None:

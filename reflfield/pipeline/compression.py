@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.clustered_pca import HALF_VECTOR
-from reflfield.field.file import write_field
+from reflfield.field.file import open_field, write_field
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.pipeline import results
 from reflfield.pipeline.alignment import aligned_frames
@@ -22,14 +22,23 @@ from reflfield.pipeline.half_vector_fit import write_half_vector_field
 from reflfield.pipeline.model_fitting import fitted_model
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.pipeline.resampling import ALL_COEFFICIENTS, Resampled
+from reflfield.pipeline.saturated_highlights import saturation_counts
 
 Floats = NDArray[np.float32]
 
 
 def write_compression(context: Context, folder: Path) -> dict[str, Any]:
-    """Fit the model that the options name -> field."""
+    """Fit the model that the options name -> field, and see what it makes of highlights."""
     if context.options.compression.model == HALF_VECTOR:
-        return write_half_vector_field(context, folder)
+        counts = write_half_vector_field(context, folder)
+    else:
+        counts = write_clustered_field(context, folder)
+    field = open_field(folder / "field.rfld")
+    return {**counts, **saturation_counts(context.refined, field)}
+
+
+def write_clustered_field(context: Context, folder: Path) -> dict[str, Any]:
+    """Fit a clustered model in the aligned frames."""
     stored = results.arrays(context, "resampling", "resampling.npz")
     coefficients = stored.pop(ALL_COEFFICIENTS)
     texels = Resampled(aligned_frames(context), completion_of(stored), coefficients)

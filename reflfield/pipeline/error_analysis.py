@@ -210,4 +210,5 @@ def _analyse_one(
             errors = errors_by_kind(pair, kinds, scores.exposure)
             if folder is not None:
                 np.savez_compressed(folder / f"{photograph.name}.{KIND_FILE}", kinds=kinds)
+        del image  # before the next one is made
     return errors

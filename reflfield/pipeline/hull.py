@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from reflfield.geometry.mesh import Mesh, write_ply
-from reflfield.geometry.occlusion import check_light_outside
+from reflfield.geometry.occlusion import cameras_inside, check_light_outside
 from reflfield.geometry.plane import image_plane
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.visual_hull import HullReport, visual_hull
@@ -19,6 +19,7 @@ from reflfield.pipeline import results
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import keeps_distances
+from reflfield.util.quoting import listed
 
 # Among the counts of the hull: names of the views that it is made without.
 LEFT_OUT = "views left out"
@@ -44,6 +45,11 @@ def write_hull(context: Context, folder: Path) -> dict[str, Any]:
     scene = RayScene(mesh)
     for light in context.training.lights:
         check_light_outside(scene, light)
+    if inside := cameras_inside(scene, context.training.cameras):
+        counts.setdefault(WARNINGS, []).append(
+            f"cameras that stand inside the hull: {listed(inside)}; check their poses, and the "
+            "silhouettes of the others"
+        )
     write_ply(folder / "hull.ply", mesh)
     (folder / "hull.json").write_text(json.dumps(plain(details)))
     return {"triangles": len(mesh.faces), "watertight": mesh.watertight, **counts}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,6 @@ from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import writers_at_once
 from reflfield.pipeline.results import ELSEWHERE, SAMPLES
 
-log = logging.getLogger(__name__)
-
 
 def write_observations(context: Context, folder: Path) -> dict[str, Any]:
     """Write apparent BRDF samples of all texels; warn of what was not measured."""
@@ -41,15 +38,17 @@ def write_observations(context: Context, folder: Path) -> dict[str, Any]:
     )
     check_measured(context.training, projected)
     write_measured(folder, projected.measured)
-    for line in clipping_lines(context.training, projected):
-        log.warning("%s", line)
     n_samples = len(results.texels(context)) * len(context.training.photographs)
     return {
         "photographs": projected.photographs,
         "samples": n_samples,
         "raw bytes": n_samples * 6,
         **{f"values {kind}": projected.count(kind) for kind in VALUE_KINDS},
-        WARNINGS: misread_lights(context, projected.looked_into),
+        WARNINGS: [
+            # Once, not again of the same photographs on another surface.
+            *(() if context.on_surface else clipping_lines(context.training, projected)),
+            *misread_lights(context, projected.looked_into),
+        ],
     }
 
 

@@ -288,6 +288,7 @@ class TestRefused:
         [
             ({"fl_x": 0.0}, "singular.*fl_x"),
             ({"fl_y": -5.0}, "fl_y > 0"),
+            ({"fl_x": 1e-3}, "in pixels, of at least .* are they millimetres"),
             ({"width": 0}, "1 x 1 pixels"),
             ({"cx": float("inf")}, "finite intrinsics"),
             ({"distortion": (0.0,) * 9}, "8 distortion"),

@@ -101,6 +101,11 @@ class TestJson:
         assert path.stat().st_size < documents.MAX_DOCUMENT_BYTES
         assert len(read_json(path)["frames"]) == 151 * 151
 
+    def test_a_key_with_two_values_is_refused_and_a_repetition_is_not(self, file):
+        with pytest.raises(CaptureError, match="two values of the key 'fl_x' in one object"):
+            read_json(file('{"cameras": [{"fl_x": 100, "w": 9, "fl_x": 120}]}'))
+        assert read_json(file('{"w": 9, "w": 9}')) == {"w": 9}
+
     def test_deep_nesting(self, file):
         with pytest.raises(CaptureError, match="expected JSON"):
             read_json(file('{"a":' * 100_000))

@@ -89,6 +89,7 @@ def test_point_at_the_light_stays_finite():
         ({"kind": "point", "intensity": [1, -1, 1]}, "intensity.*>= 0"),
         ({"kind": "directional", "direction": [0, 0, 0]}, "direction.*not zero"),
         ({"kind": "spot", "cone_angle": 0.1, "falloff_angle": 0.5}, "falloff_angle <= cone"),
+        ({"kind": "point", "intensity": [0, 1e-320, 0]}, "one of at least 1e-30 in"),
         ({"kind": "environment"}, "needs the file"),
         ({"kind": "environment", "file": Path("a"), "convention": "x"}, "convention.*'x'"),
         (

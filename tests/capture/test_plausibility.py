@@ -105,3 +105,14 @@ class TestUnits:
         notes = [note for note in open_capture(frozen).notes if "one unit" in note]
         assert len(notes) == n_notes
         assert all("times as far" in note for note in notes)
+
+
+@pytest.mark.parametrize(("factor", "n_notes"), [(1.01, 0), (2.0, 1)])
+def test_oblong_pixels_are_noted(frozen, factor, n_notes):
+    def stretch(document):
+        camera = document["cameras"][0]
+        camera["fl_y"] = factor * camera["fl_x"]
+
+    described(frozen, stretch)
+    notes = [note for note in open_capture(frozen).notes if "oblong in v000" in note]
+    assert len(notes) == n_notes

@@ -66,6 +66,12 @@ class TestLp:
         with pytest.raises(CaptureError, match=r"dome\.lp: .*z > 0, received [23] of 3"):
             self.opened(tmp_path, *(f"1.png {light}" for light in lights))
 
+    def test_azimuth_and_elevation_are_no_direction(self, tmp_path):
+        photograph(tmp_path / "1.png")
+        photograph(tmp_path / "2.png")
+        with pytest.raises(CaptureError, match=r"dome\.lp: .* 2 that are all within .*angles"):
+            self.opened(tmp_path, "1.png 30 45 1", "2.png 60 45 1")
+
     @pytest.mark.parametrize("more", ["1.0", "1 .9 .8"])
     def test_intensities_behind_the_direction_are_said(self, tmp_path, more):
         photograph(tmp_path / "a 1.png")

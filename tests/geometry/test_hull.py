@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rigs
@@ -23,6 +25,21 @@ def test_the_surface_lies_on_the_exact_cones():
     assert error.max() < 0.15
     assert mesh.watertight
     assert report.overlap.min() > 0.995
+
+
+def test_cameras_that_all_stand_at_one_place_are_refused():
+    apart = rigs.cameras(4)
+    silhouettes = [rigs.ball_silhouette(view) for view in apart]
+    views = [replace(view, camera_from_world=_turned_alone(view)) for view in apart]
+    with pytest.raises(GeometryError, match="views from several places, received 4 that all"):
+        visual_hull(views, silhouettes, RAW)
+
+
+def _turned_alone(view):
+    """Pose of a camera that has been put to the origin."""
+    pose = view.camera_from_world.copy()
+    pose[:3, 3] = 0.0
+    return pose
 
 
 def test_the_hull_holds_the_object_and_shrinks_with_more_views(rng):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,6 +10,7 @@ from reflfield.errors import InputError
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.occlusion import (
     VisibilityOptions,
+    cameras_inside,
     check_light_outside,
     depth_edges,
     light_visibility,
@@ -197,6 +200,21 @@ def test_a_light_inside_the_object_is_refused_by_name():
     with pytest.raises(InputError, match=r"light 'l042'.*inside its hull"):
         check_light_outside(RayScene(mesh), Light("l042", "point", position=[0.5, 0, 0]))
     check_light_outside(RayScene(mesh), Light("l", "directional"))
+
+
+def test_cameras_inside_the_object_are_refused_or_named():
+    scene = RayScene(two_balls())
+
+    def camera(name, *centre):
+        pose = np.eye(4)
+        pose[:3, 3] = -np.array(centre)
+        return replace(top_camera(), id=name, camera_from_world=pose)
+
+    inside, outside = camera("v3", 0.5, 0, 0), camera("v4", 0, 0, 9)
+    assert cameras_inside(scene, [inside, outside]) == ("v3",)
+    assert cameras_inside(scene, [outside]) == ()
+    with pytest.raises(InputError, match=r"cameras: .* 2 that are all inside its hull.*'v3'"):
+        cameras_inside(scene, [inside, inside])
 
 
 def test_options_are_checked():

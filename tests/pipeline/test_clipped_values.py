@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture
+from reflfield.capture.capture import Capture, Photograph
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.observations.image_projection import VALUE_KINDS, LookedInto, Projected
@@ -28,14 +28,15 @@ def capture():
     return Capture("vase", Path("/"), cameras, (Light("l0", "directional"),), ())
 
 
-def projected(darkest=0.0, **kinds):
+def projected(darkest=0.0, peak=0.9, **kinds):
     """Values of two cameras by kind."""
     values = np.zeros((2, len(VALUE_KINDS)), np.int64)
     for kind, counts in kinds.items():
         values[:, VALUE_KINDS.index(kind)] = counts
     none = np.zeros(0, np.int64)
     nothing = LookedInto(none, none, np.zeros((0, 3), np.float32), np.zeros((0, 3), bool))
-    return Projected(2, values, np.ones((3, 1), bool), 1.0, darkest, nothing)
+    peaks = np.array([[0.8], [peak]], np.float32)
+    return Projected(2, values, np.ones((3, 1), bool), 1.0, darkest, peaks, nothing)
 
 
 def test_worst_camera_is_named_where_more_than_a_trace_is_saturated(capture):
@@ -54,6 +55,15 @@ def test_negative_values_are_told_but_not_noise_about_black(capture):
     assert not list(clipping_lines(capture, projected(darkest=-0.05, measured=[9, 9])))
     (line,) = clipping_lines(capture, projected(darkest=-0.8, measured=[9, 9]))
     assert "values on the object are negative, down to -80% of the brightest" in line
+
+
+def test_an_absurd_pixel_is_told_with_its_photograph(capture):
+    photographs = tuple(Photograph(name, i, 0, ()) for i, name in enumerate(("one", "two")))
+    both = replace(capture, photographs=photographs)
+    assert not list(clipping_lines(both, projected(peak=1e6, measured=[9, 9])))
+    (line,) = clipping_lines(both, projected(peak=1e38, measured=[9, 9]))
+    assert line.startswith("photographs: 'two' has values up to 1e+38")
+    assert not list(clipping_lines(both, replace(projected(), peaks=np.zeros((2, 1)))))
 
 
 @pytest.mark.parametrize("kind", ["saturated", "transparent", "dark"])

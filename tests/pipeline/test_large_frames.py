@@ -4,49 +4,18 @@ import json
 import re
 import shutil
 
-import cv2
-import numpy as np
 import pytest
 
-from reflfield.capture.encoding import encode_srgb
-from reflfield.capture.image_files import read_image
+from tests.large_captures import enlarged_capture
 
 SIDE = 1400
-VIEWS, LIGHTS = (0, 3, 4, 8), (0, 1)
-
-
-def enlarged(path, picture):
-    """Write an 8-bit picture with `SIDE` pixels a side, hardly compressed."""
-    large = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)
-    cv2.imwrite(str(path), large, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
 
 @pytest.fixture(scope="module")
 def large_capture(tiny_capture, tmp_path_factory):
     """Four views and two lights of the tiny capture, every pixel many times as large."""
-    folder = tmp_path_factory.mktemp("large")
-    document = json.loads((tiny_capture / "capture.json").read_text())
-    document.pop("truth", None)
-    document["cameras"] = [document["cameras"][i] for i in VIEWS]
-    document["lights"] = [document["lights"][i] for i in LIGHTS]
-    document["photographs"] = []
-    for name in ("photographs", "silhouettes"):
-        (folder / name).mkdir()
-    for camera in document["cameras"]:
-        scale = SIDE / camera["w"]
-        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
-            camera[key] = type(camera[key])(camera[key] * scale)
-        mask = cv2.imread(str(tiny_capture / camera["silhouette"]), cv2.IMREAD_GRAYSCALE)
-        enlarged(folder / camera["silhouette"], mask)
-        for light in document["lights"]:
-            name = f"photographs/{camera['id']}_{light['id']}"
-            radiance = read_image(tiny_capture / f"{name}.exr")
-            codes = np.clip(encode_srgb(radiance) * 255, 1, 254).astype(np.uint8)
-            enlarged(folder / f"{name}.png", codes[..., ::-1])
-            document["photographs"].append(
-                {"camera": camera["id"], "light": light["id"], "file": f"{name}.png"}
-            )
-    (folder / "capture.json").write_text(json.dumps(document))
+    folder = tmp_path_factory.mktemp("large") / "capture"
+    enlarged_capture(tiny_capture, folder, SIDE)
     yield folder
     shutil.rmtree(folder)
 

@@ -1,0 +1,89 @@
+"""Memory of whole runs of large photographs: the peak of each stage, and of each command.
+
+    python tests/benchmarks/bench_memory.py --side 4000 --max-memory 2GB
+    python tests/benchmarks/bench_memory.py --side 1000 --max-memory 1GB --model clustered
+
+A small capture is simulated (4 views under 2 lights) and every pixel made many, so that the
+files are large and the field is small. ``reflfield run``, ``relight`` and ``compare`` then run
+in processes of their own with that ceiling. Peaks are of resident memory, the command and its
+processes together, looked at 20 times a second. Prints only; status 1 if a command fails or
+takes more than it may.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import psutil
+
+from capture_sim.scene import parse_scene
+from capture_sim.write import write_capture
+from reflfield.options import gigabytes, parse_bytes
+from reflfield.pipeline.cache import resident_bytes
+from tests.large_captures import enlarged_capture
+from tests.pipeline.conftest import SCENE
+
+SETTINGS = ("texture.largest=64", "hull.resolution=32", "relighting.samples_per_pixel=1")
+
+
+def watched(words):
+    """Status of a command, and the largest resident memory of all its processes."""
+    process, peak = subprocess.Popen([sys.executable, "-m", "reflfield.cli", *words]), 0
+    while process.poll() is None:
+        try:
+            peak = max(peak, resident_bytes(psutil.Process(process.pid)))
+        except psutil.NoSuchProcess:
+            break
+        time.sleep(0.05)
+    return process.wait(), peak
+
+
+def commands(folder, ceiling, model):
+    """Words of each command, by its name."""
+    capture, out = str(folder / "large"), folder / "out"
+    limit = ("--max-memory", ceiling)
+    settings = [word for text in SETTINGS for word in ("--set", text)]
+    field, drawn = str(out / "field.rfld"), ("--rays-per-pixel", "1", *limit)
+    relit, compared = str(folder / "relit"), str(folder / "compared")
+    return {
+        "run": ("run", capture, "-o", str(out), "--hold-out", "photographs=1", *limit,
+                *settings, "--set", f"compression.model={model}"),
+        "relight": ("relight", field, "--capture", capture, "-o", relit, *drawn),
+        "compare": ("compare", field, capture, "-o", compared, *drawn),
+    }  # fmt: skip
+
+
+def main():
+    """Simulate, enlarge, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--side", type=int, default=4000, help="pixels of a photograph's side")
+    parser.add_argument("--max-memory", default="2GB", help="ceiling of every command")
+    parser.add_argument("--model", default="half_vector", choices=("half_vector", "clustered"))
+    arguments = parser.parse_args()
+    ceiling, failed = parse_bytes(arguments.max_memory), False
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_capture(parse_scene(SCENE), folder / "small")
+        enlarged_capture(folder / "small", folder / "large", arguments.side)
+        for command, words in commands(folder, arguments.max_memory, arguments.model).items():
+            status, peak = watched(words)
+            failed |= status != 0 or peak > ceiling
+            print(f"{command}: status {status}, at most {gigabytes(peak)} of "
+                  f"{gigabytes(ceiling)}", flush=True)  # fmt: skip
+            if command == "run" and status == 0:
+                timings = json.loads((folder / "out" / "timings.json").read_text())
+                for stage in timings["stages"]:
+                    print(f"  {stage['name']:<22}{stage['peak_bytes'] / 2**30:5.2f} GB")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
