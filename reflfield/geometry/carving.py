@@ -20,6 +20,9 @@ _SLOPE_ALLOWANCE = 1.1
 _COARSE_CELLS = 12
 
 _BLOCK_POINTS = 1 << 16
+# Up to so many views that may undercut a distance the lowest distances are kept sorted; of more
+# views all distances of a block of points are looked through.
+_MOST_SORTED, _PARTITIONED_POINTS = 4, 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +120,8 @@ def smallest_distance(
     Points found below ``-cutoff`` are not followed further: their value is some number
     below ``-cutoff``.
     """
+    if tolerance > _MOST_SORTED:
+        return _partitioned_distance(views, points, tolerance)
     lowest = np.full((tolerance + 1, len(points)), np.inf)
     alive = np.arange(len(points))
     # One view after the other: their distances may be in files.
@@ -126,6 +131,17 @@ def smallest_distance(
             _insert(lowest, some, view.distance(points[some]))
         alive = alive[lowest[-1, alive] >= -cutoff]
     values: Array = lowest[-1]
+    return values
+
+
+def _partitioned_distance(views: Sequence[View], points: Array, tolerance: int) -> Array:
+    """`smallest_distance` without a cutoff, block by block; infinite without enough views."""
+    values = np.full(len(points), np.inf)
+    for begin in range(0, len(points), _PARTITIONED_POINTS):
+        some = slice(begin, begin + _PARTITIONED_POINTS)
+        of_views = np.stack([view.distance(points[some]) for view in views], axis=1)
+        if tolerance < len(views):
+            values[some] = np.partition(of_views, tolerance, axis=1)[:, tolerance]
     return values
 
 

@@ -62,7 +62,9 @@ _COLLAPSED = 0.1
 _HOPELESS = 0.5
 
 # Of so many silhouettes that were made from photographs one may miss a part of the object.
-MADE_VIEWS_PER_WRONG = 40
+MADE_VIEWS_PER_WRONG = 10
+# Fewer than so many of those are judged like silhouettes that are given.
+_MANY_MADE = 60
 # Median overlap of those with the hull from which they are taken to be of one object.
 _MADE_OVERLAP = 0.8
 
@@ -223,7 +225,8 @@ def visual_hull(
     options = options or HullOptions()
     views = measured_views(cameras, silhouettes, scratch)
     views, silhouettes, specks = without_specks(views, silhouettes, scratch)
-    n_wrong = len(views) // MADE_VIEWS_PER_WRONG if made and options.tolerance == AUTO else 0
+    bears_wrong = made and options.tolerance == AUTO and len(views) >= _MANY_MADE
+    n_wrong = len(views) // MADE_VIEWS_PER_WRONG if bears_wrong else 0
     with noting_small_parts(views):
         outcome = _hull_of_made(views, silhouettes, options, n_wrong) if n_wrong else None
         if outcome is None:

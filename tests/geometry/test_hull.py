@@ -5,6 +5,8 @@ import pytest
 import rigs
 
 from reflfield.errors import GeometryError, InputError
+from reflfield.geometry import carving
+from reflfield.geometry.cones import measured_views
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.visual_hull import HullOptions, visual_hull
 
@@ -194,15 +196,31 @@ def test_sizes_and_counts_are_checked():
         HullOptions(resolution=7)
 
 
-def test_one_of_forty_made_silhouettes_may_miss_a_part():
+def test_one_of_ten_made_silhouettes_may_miss_a_part():
     """Each of the views carves where it sees nothing; of made ones a few may be wrong."""
     views = rigs.cameras(80, size=48)
     silhouettes = [rigs.ball_silhouette(view, samples=2) for view in views]
-    for wrong in (20, 60):
+    for wrong in (20, 60, 61):
         silhouettes[wrong][:, 24:] = 0.0
     options = HullOptions(resolution=32, blur=0.0, smoothing=0, n_triangles=0)
     mesh, report = visual_hull(views, silhouettes, options, made=True)
     whole, _ = visual_hull(views, [rigs.ball_silhouette(v, samples=2) for v in views], options)
     assert mesh.volume == pytest.approx(whole.volume, rel=0.03)
-    assert sorted(np.argsort(report.overlap)[:2]) == [20, 60]
+    assert sorted(np.argsort(report.overlap)[:3]) == [20, 60, 61]
     assert not report.left_out
+
+
+@pytest.mark.parametrize("tolerance", [0, 2, 5, 17, 18])
+def test_distances_that_some_views_undercut_do_not_depend_on_how_they_are_found(
+    rng, monkeypatch, tolerance
+):
+    views = rigs.cameras(18, size=48)
+    measured = measured_views(views, [rigs.ball_silhouette(v, samples=2) for v in views])
+    points = rng.normal(size=(3000, 3)) * 0.7
+    found = []
+    for most in (-1, 100):
+        monkeypatch.setattr(carving, "_MOST_SORTED", most)
+        monkeypatch.setattr(carving, "_PARTITIONED_POINTS", 700)
+        found.append(carving.smallest_distance(measured, points, tolerance, np.inf))
+    np.testing.assert_array_equal(*found)
+    assert np.isfinite(found[0]).all() == (tolerance < 18)
