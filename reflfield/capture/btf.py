@@ -104,18 +104,33 @@ class Btf:
 
         Along directions `view` and `light` of the sampling, in the frame of the sample: where
         texels have rotations, values between those of the table are interpolated, linearly
-        over triangles of stereographic coordinates. A texel that the direction is below of
-        has the value 0.
+        over triangles of stereographic coordinates. Texels that a direction lies below have
+        the value 0.
+
+        Raises
+        ------
+        CaptureError
+            If a value is beyond single precision.
         """
-        cosine = float(self.lights[light, 2])
-        if self.rotations is None:
-            columns = np.arange(self.width * self.height)
-            pairs = np.full((len(columns), 1), view), np.full((len(columns), 1), light)
-            values = self._entries(columns, *pairs)[:, 0, 0]
-            values = values if self.cosine_included else values * cosine
-        else:
-            values = self._turned(self.views[view], self.lights[light])
-        return values.reshape(self.height, self.width, 3).astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.rotations is None:
+                values = self._as_sampled(view, light)
+            else:
+                values = self._turned(self.views[view], self.lights[light])
+            image = values.reshape(self.height, self.width, 3).astype(np.float32)
+        if not np.isfinite(image).all():
+            raise CaptureError(
+                f"view {view}, light {light}: expected values within single precision, "
+                "received larger ones; the container is damaged"
+            )
+        return image
+
+    def _as_sampled(self, view: int, light: int) -> Array:
+        """Values of all texels along two directions of the sampling."""
+        columns = np.arange(self.width * self.height)
+        pairs = np.full((len(columns), 1), view), np.full((len(columns), 1), light)
+        values = self._entries(columns, *pairs)[:, 0, 0]
+        return values if self.cosine_included else values * self.lights[light, 2]
 
     def _turned(self, view: Array, light: Array) -> Array:
         """Values along directions of the sample, of texels with rotations."""
