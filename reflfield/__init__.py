@@ -25,6 +25,9 @@ A field is rendered and evaluated; here one of known reflectance, a white square
 >>> up = np.array([0.0, 0.0, 1.0])
 >>> values = field.evaluate([0, 1], up, up)  # apparent BRDF, 1/sr
 
+Samples from elsewhere, a measured BTF for example, are completed (`complete`) and given local
+frames (`align`) without a capture.
+
 Names are imported when they are first used. See Müller, Sarlette and Klein, "Data-driven Local
 Coordinate Systems for Image-Based Rendering", Eurographics 2006, for the method that this
 package implements and extends.
@@ -35,6 +38,8 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
+    from reflfield.alignment.align_texels import Alignment, align
+    from reflfield.alignment.refinement import RefinementOptions
     from reflfield.api.captures import describe_capture, open_capture
     from reflfield.api.example import example_field
     from reflfield.api.fields import Field, open_field
@@ -51,6 +56,7 @@ if _TYPE_CHECKING:
         ReflfieldError,
         ShapeError,
     )
+    from reflfield.factorization.svd_completion import Completion, complete
     from reflfield.field.clustered_pca import CompressionOptions
     from reflfield.field.half_vector import HalfVectorOptions
     from reflfield.field.sample_fit import SampleFitOptions
@@ -74,12 +80,14 @@ __version__ = "0.1.0"
 
 # What is promised: names, and their arguments (`tests/data/public_api.txt`).
 __all__ = [
+    "Alignment",
     "AlignmentOptions",
     "AtlasOptions",
     "Camera",
     "Capture",
     "CaptureError",
     "ComparisonOptions",
+    "Completion",
     "CompletionOptions",
     "CompressionOptions",
     "DirectionalLight",
@@ -95,6 +103,7 @@ __all__ = [
     "Light",
     "PipelineOptions",
     "PointLight",
+    "RefinementOptions",
     "ReflfieldError",
     "RenderOptions",
     "ResamplingOptions",
@@ -104,7 +113,9 @@ __all__ = [
     "ShapeError",
     "TextureOptions",
     "VisibilityOptions",
+    "align",
     "compare",
+    "complete",
     "describe_capture",
     "example_field",
     "open_capture",
@@ -117,6 +128,8 @@ __all__ = [
 
 # Module of each name; type checkers see the imports above.
 _MODULES = {
+    "reflfield.alignment.align_texels": ("Alignment", "align"),
+    "reflfield.alignment.refinement": ("RefinementOptions",),
     "reflfield.api.captures": ("describe_capture", "open_capture"),
     "reflfield.api.example": ("example_field",),
     "reflfield.api.fields": ("Field", "open_field"),
@@ -129,6 +142,7 @@ _MODULES = {
         *("CaptureError", "FieldFileError", "GeometryError"),
         *("InputError", "ReflfieldError", "ShapeError"),
     ),
+    "reflfield.factorization.svd_completion": ("Completion", "complete"),
     "reflfield.options": ("HoldOut", "Resources"),
     "reflfield.pipeline.pipeline_options": (
         *("AlignmentOptions", "AtlasOptions", "ComparisonOptions", "CompletionOptions"),

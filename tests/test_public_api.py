@@ -34,10 +34,10 @@ HEAVIER = (
     *("xatlas", "jsonschema", "fsspec", "flip_evaluator", "OpenEXR", "multiprocessing.pool"),
 )
 # Seconds of CPU time: six times what is asked for of an idle core, since work on the other
-# hardware threads doubles and trebles it. Imports and opening take .35 to .42 s, .1
-# of it NumPy and .25 Numba with LLVM, which every kernel needs. The first evaluation takes .36 s
-# more, in which Numba loads the types of all that it knows before the first compiled kernel;
-# half of that is SciPy's linear algebra, by which Numba finds out whether it could call BLAS.
+# hardware threads doubles and trebles it. Imports and opening take .35 to .42 s: .1 for NumPy
+# and .25 for Numba with LLVM, which every kernel needs. The first evaluation takes .36 s more,
+# in which Numba loads the types of all that it knows before the first compiled kernel; half of
+# that is SciPy's linear algebra, by which Numba finds out whether it could call BLAS.
 MOST_IMPORTING = 3.0
 
 
@@ -136,7 +136,7 @@ class TestImports:
         assert not set(HEAVIER) & set(steps[2][1])
         seconds = steps[2][0] - steps[0][0]
         with capsys.disabled():
-            print(f" [opening and evaluating: {seconds:.2f} s of the processor]", end="")
+            print(f" [opening and evaluating: {seconds:.2f} s of CPU time]", end="")
         assert seconds < MOST_IMPORTING
 
     def test_of_rendering_are_neither_cluster_nor_plots(self, steps):

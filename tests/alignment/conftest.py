@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).resolve().parent
-EXAMPLES = HERE.parents[1] / "examples"
+BENCHMARKS = HERE.parent / "benchmarks"
 
 
 def _module(path):
@@ -19,7 +19,7 @@ def _module(path):
 @pytest.fixture(scope="session")
 def scene():
     """The synthetic scene of the paper's section 5.1."""
-    return _module(EXAMPLES / "synthetic_btf.py")
+    return _module(BENCHMARKS / "synthetic_btf.py")
 
 
 @pytest.fixture(scope="session")

@@ -28,12 +28,12 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / "examples")]
+sys.path.insert(0, str(HERE.parent))
 
 import numpy as np  # noqa: E402
 from benchmarks.measuring import Results, on_cores  # noqa: E402
 from benchmarks.peers import missing  # noqa: E402
-from synthetic_btf import (  # noqa: E402
+from benchmarks.synthetic_btf import (  # noqa: E402
     RINGS_151,
     dome_directions,
     relief_frames,
@@ -107,7 +107,7 @@ def problem(band_limit, n, noise, n_samples=64):
 def maxima(abrdfs, target, planted):
     """(n, 2, 3, 3): the two highest rotations of each exact series, in double precision.
 
-    Climbed from the planted frame and from the best that a search with twice the usual
+    Ascent from the planted frame and from the best that a search with twice the usual
     number of peaks finds; the higher counts.
     """
     source, aim = couple(abrdfs.astype(np.float64)), couple(target[None].astype(np.float64))
@@ -115,9 +115,9 @@ def maxima(abrdfs, target, planted):
         couple(abrdfs), couple(target[None]), n_peaks=16, margins=False
     ).rotations
     series, rows = spectrum(source, aim.units()), np.arange(len(abrdfs))
-    climbed = [follow(series, rows, start, 30) for start in (rotations, planted)]
-    higher = climbed[0][1][:, 0] >= climbed[1][1][:, 0]
-    best = np.where(higher[:, None, None], climbed[0][0], climbed[1][0])
+    ascended = [follow(series, rows, start, 30) for start in (rotations, planted)]
+    higher = ascended[0][1][:, 0] >= ascended[1][1][:, 0]
+    best = np.where(higher[:, None, None], ascended[0][0], ascended[1][0])
     return np.stack([best, follow(series, rows, best @ HALF_TURN, 30)[0]], axis=1)
 
 

@@ -18,17 +18,17 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parents[1] / "examples")]
+sys.path.insert(0, str(HERE.parent))
 
 import numpy as np  # noqa: E402
 from benchmarks.measuring import Results  # noqa: E402
-from scipy.optimize import linear_sum_assignment  # noqa: E402
-from synthetic_btf import (  # noqa: E402
+from benchmarks.synthetic_btf import (  # noqa: E402
     dome_directions,
     frame_errors,
     relief_frames,
     sample_texels,
 )
+from scipy.optimize import linear_sum_assignment  # noqa: E402
 
 from reflfield.alignment import align  # noqa: E402
 

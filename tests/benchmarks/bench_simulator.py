@@ -196,7 +196,7 @@ def write_whole(scene, workers, max_memory, results):
     results.table(f"The whole capture, {workers} workers")
     results.row(photographs=n, wall_s=wall, CPU_s=spent, GB=size / 1e9, peak_memory_GB=peak)
     print(f"whole capture, {workers} workers: {n} photographs in {wall:.0f} s, {spent:.0f} s "
-          f"of the processor, {size / 1e9:.2f} GB, peak memory {peak:.2f} GB of "
+          f"of CPU time, {size / 1e9:.2f} GB, peak memory {peak:.2f} GB of "
           f"{max_memory / 2**30:.2f} allowed")  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Time and peak memory of a piece of work; figures in files, with what they were measured on.
 
-Benchmarks, and examples that measure, fill a `Results` and write it: ``results/NAME.json``.
+Benchmarks fill a `Results` and write it: ``results/NAME.json``.
 ``make_results.py`` makes the pages from these files.
 """
 

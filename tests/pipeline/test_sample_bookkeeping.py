@@ -25,22 +25,22 @@ def finished_context(run_copy, tiny_capture, tiny_options):
     return context
 
 
-def test_all_accounts_add_up(finished_context):
-    accounts = {(a.stage, a.things): a for a in sample_counts(finished_context)}
-    assert [account.missing for account in accounts.values()] == [0] * 7
-    photographs = accounts["observations", "photographs"]
+def test_all_counts_add_up(finished_context):
+    counts = {(a.stage, a.things): a for a in sample_counts(finished_context)}
+    assert [count.missing for count in counts.values()] == [0] * 7
+    photographs = counts["observations", "photographs"]
     assert photographs.total == 60
     # One of ten views and one of six lights: 9 x 5 projected, the pair compared, 5 + 9 apart.
     assert list(photographs.parts.values()) == [45, 1, 14]
-    values = accounts["observations", "values"]
+    values = counts["observations", "values"]
     assert (
         values.total
         == values.parts["measured"]
         == 3 * 5 * results.view_visible(finished_context).sum()
     )
-    samples = accounts["compression", "samples"]
+    samples = counts["compression", "samples"]
     assert samples.total == 45 * len(results.texels(finished_context))
-    assert accounts["comparison", "photographs"].total == 3
+    assert counts["comparison", "photographs"].total == 3
 
 
 def test_samples_fitted_are_those_with_weight_in_the_fit(finished_context):
@@ -52,14 +52,14 @@ def test_samples_fitted_are_those_with_weight_in_the_fit(finished_context):
         * transformed.light_weights[:, None]
         * transformed.pairs
     )
-    account = next(
+    count = next(
         a
         for a in sample_counts(finished_context)
         if (a.stage, a.things) == ("compression", "samples")
     )
     # The file holds frames quantised to a degree: of the samples that near the horizon, one in
     # a hundred, some change sides; 14 of 6,710 when this was written.
-    assert account.parts["fitted"] == pytest.approx(np.count_nonzero(weights), rel=5e-3)
+    assert count.parts["fitted"] == pytest.approx(np.count_nonzero(weights), rel=5e-3)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_samples_fitted_are_those_with_weight_in_the_fit(finished_context):
 def test_a_stage_that_loses_one_is_found_out(finished_context, stage, count):
     record = next(r for r in finished_context.stages.records if r.name == stage)
     record.counts[count] -= 1
-    assert sum(account.missing for account in sample_counts(finished_context)) == 1
+    assert sum(one.missing for one in sample_counts(finished_context)) == 1
 
 
 def test_a_frame_that_was_not_measured_is_found_out(finished_context):
@@ -80,4 +80,4 @@ def test_a_frame_that_was_not_measured_is_found_out(finished_context):
     metrics = json.loads(path.read_text())
     metrics["frames"].pop()
     path.write_text(json.dumps(metrics))
-    assert sum(account.missing for account in sample_counts(finished_context)) == 1
+    assert sum(one.missing for one in sample_counts(finished_context)) == 1

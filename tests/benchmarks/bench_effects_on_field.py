@@ -1,7 +1,7 @@
 """What each effect of the simulator does to the pipeline: one at a time on one scene.
 
-    python examples/effects_on_the_pipeline.py OUT
-    python examples/effects_on_the_pipeline.py OUT --effects defocus,bayer
+    python tests/benchmarks/bench_effects_on_field.py OUT
+    python tests/benchmarks/bench_effects_on_field.py OUT --effects defocus,bayer
 
 Simulates the scene without errors and once with each effect, makes a field of each
 capture, and compares it with true photographs of unseen views under unseen lights, with
@@ -21,7 +21,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import matplotlib
 
@@ -110,7 +110,7 @@ def table(results: dict[str, dict]) -> str:
 def written(scene: str, scores: dict[str, dict]) -> Path:
     """Write the table as results; their path."""
     results = Results(
-        "effects_on_the_pipeline",
+        "effects_on_field",
         "What each effect does to the field",
         ["reflfield.pipeline.stages", "capture_sim.write"],
     )

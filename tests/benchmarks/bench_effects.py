@@ -1,6 +1,6 @@
 """Preset by effect: what the plan switches on, what each effect changes, and its cost.
 
-    python examples/effects_of_presets.py
+    python tests/benchmarks/bench_effects.py
 
 Renders a few small photographs of every preset with each effect that it describes and
 without, and prints a Markdown table: the largest change in percent of the photograph's 99th
@@ -16,7 +16,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.measuring import Results
 
@@ -90,7 +90,7 @@ def main() -> None:
         mistakes += [f"{name}: {effect}" for effect in wrong]
     print("| effect | " + " | ".join(f"`{name}`" for name in PRESETS) + " |")
     print("|---" * (len(PRESETS) + 1) + "|")
-    results = Results("effects_of_presets", "What each effect changes", ["capture_sim.write"])
+    results = Results("effects", "What each effect changes", ["capture_sim.write"])
     results.table(f"Percent of the 99th percentile; {arguments.side} pixels; (ms); bold: on")
     for effect in EFFECTS:
         cells = [columns[name].get(effect.NAME, "-") for name in PRESETS]

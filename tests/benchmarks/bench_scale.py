@@ -1,9 +1,9 @@
 """The paper's job, 151 x 151 photographs and 256 x 256 texels, on this machine.
 
-    python examples/paper_scale.py OUT             # simulate, process, compress, compare
-    python examples/paper_scale.py OUT --kill 5    # killed five times: the same bytes?
-    python examples/paper_scale.py OUT --kill-worker nanny    # on a cluster that loses workers
-    python examples/paper_scale.py OUT --per-texel 64 128 256
+    python tests/benchmarks/bench_scale.py OUT    # simulate, process, compress, compare
+    python tests/benchmarks/bench_scale.py OUT --kill 5
+    python tests/benchmarks/bench_scale.py OUT --kill-worker nanny
+    python tests/benchmarks/bench_scale.py OUT --per-texel 64 128 256
 
 A vase of glaze and paint with brushed bands of gold stands in a dome. The first form prints
 seconds and peak memory of every stage; the second processes once more, kills the process
@@ -33,7 +33,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import distributed
 from benchmarks.measuring import Results
@@ -142,7 +142,7 @@ def processed(arguments: argparse.Namespace, capture: Path) -> None:
     out = arguments.out / "run"
     call(*process_words(arguments, capture, out, arguments.texels, 2048))
     timings = json.loads((out / "timings.json").read_text())
-    results = Results("paper_scale", "The paper's job", MEASURED)
+    results = Results("scale", "The paper's job", MEASURED)
     size = f"{arguments.pixels} pixels, {arguments.texels} texels a side"
     results.table(f"{arguments.rig}, {size}")
     for stage in timings["stages"]:
@@ -370,9 +370,9 @@ def kill_worker(
 
 def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
     """Print the processor time of one texel at several sizes of the texture."""
-    print("texture       texels   ms of the processor per texel: " + ", ".join(BY_TEXELS))
+    print("texture       texels   CPU time per texel, ms: " + ", ".join(BY_TEXELS))
     totals = []
-    results = Results("paper_scale_per_texel", "What one texel costs", MEASURED)
+    results = Results("scale_per_texel", "What one texel costs", MEASURED)
     results.table(f"{arguments.rig}, CPU time of a texel, ms")
     for side in arguments.per_texel:
         out = arguments.out / f"texels_{side}"

@@ -1,8 +1,8 @@
 """The synthetic scene of the paper's section 5.1, rebuilt: frames, directions, samples.
 
 A raised ring and bars on a plane, tangents modulated by cosines, one anisotropic
-material (M. Ashikhmin, P. Shirley, "An anisotropic Phong BRDF model", 2000). The examples,
-the tests of the alignment and its benchmark all use it.
+material (M. Ashikhmin, P. Shirley, "An anisotropic Phong BRDF model", 2000). The tests of
+the alignment and its benchmarks use it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What accuracy costs: error of recovered frames against time, one picture and its table.
 
-    python examples/accuracy_against_time.py [--texels 600] [-o accuracy]
+    python tests/benchmarks/bench_accuracy.py [--texels 600] [-o accuracy]
 
 On the synthetic scene of section 5.1 (81 x 81 directions). Points, in CPU time of one core:
 
@@ -30,14 +30,14 @@ from typing import NamedTuple
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
-TESTS = Path(__file__).resolve().parents[1] / "tests"
+TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS / "alignment")]
 
 import matplotlib  # noqa: E402
 import numpy as np  # noqa: E402
 import paper_forms  # noqa: E402
 from benchmarks.measuring import Results  # noqa: E402
-from synthetic_btf import (  # noqa: E402
+from benchmarks.synthetic_btf import (  # noqa: E402
     dome_directions,
     frame_errors,
     relief_frames,
@@ -111,13 +111,13 @@ def timed(work):
 def point(kind, label, band_limit, seconds, local_from_base, truth):
     """Errors of some frames; a common turn about the normals is free."""
     n = len(local_from_base)
-    found = with_the_truths_tangents(local_from_base, truth[:n])
-    normals, tangents = frame_errors(found, truth[:n])
+    recovered = with_the_truths_tangents(local_from_base, truth[:n])
+    normals, tangents = frame_errors(recovered, truth[:n])
     return Point(kind, label, band_limit, n, seconds / n * 1e3, normals.mean(), tangents.mean())
 
 
 def local(rotations):
-    """Frames of rotations found by a search."""
+    """Frames of the rotations of a search."""
     return np.swapaxes(rotations, 1, 2)
 
 
@@ -145,8 +145,8 @@ def problem(data, band_limit):
 def exact_point(task, truth):
     """Global search, to the peak."""
     source, target = couple(task.coefficients), couple(task.target[None])
-    found, seconds = timed(lambda: search(source, target, margins=False))
-    return point("exact", "exact", task.band_limit, seconds, local(found.rotations), truth)
+    maxima, seconds = timed(lambda: search(source, target, margins=False))
+    return point("exact", "exact", task.band_limit, seconds, local(maxima.rotations), truth)
 
 
 def rank_points(task, rank, truth):
@@ -205,13 +205,15 @@ def refined_points(data, most):
     for rounds in range(most + 1):
         refine = RefinementOptions(rounds=rounds) if rounds else False
         start = time.process_time()
-        found = align(
+        alignment = align(
             data.samples, data.directions, data.directions, DEFAULT_LIMIT, refine=refine
         )
         seconds = time.process_time() - start
         label = f"{rounds} rounds"
         points.append(
-            point("refined", label, DEFAULT_LIMIT, seconds, found.local_from_base, data.frames)
+            point(
+                "refined", label, DEFAULT_LIMIT, seconds, alignment.local_from_base, data.frames
+            )
         )
     return points
 
@@ -261,7 +263,7 @@ def write_table(points, path):
 
 def written(points):
     """Write the table as results; their path."""
-    results = Results("accuracy_against_time", "What accuracy of the frames costs", MEASURED)
+    results = Results("accuracy", "What accuracy of the frames costs", MEASURED)
     results.table("CPU time of one core; mean errors in degrees")
     for one in points:
         results.add(

@@ -5,7 +5,7 @@ seen from 81 directions under 81 lights. Prints times and errors of the harmonic
 the refinement, for clean samples, for noise and for unobserved ones, and how many unaligned
 components equal two aligned ones (the paper: 20). Draws what its figures 4, 5 and 6 show.
 
-    python examples/align_synthetic_btf.py [--size 124 90] [-o synthetic_btf]
+    python tests/benchmarks/bench_synthetic_btf.py [--size 124 90] [-o synthetic_btf]
 
 The aligned matrix holds the material as it would be sampled from the same 81 directions in
 the recovered frames, so its components tell the error of the frames and nothing else.
@@ -19,13 +19,12 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import matplotlib
 import numpy as np
 from benchmarks.measuring import Results
-from matplotlib.colors import LogNorm
-from synthetic_btf import (
+from benchmarks.synthetic_btf import (
     ashikhmin_shirley,
     dome_directions,
     frame_errors,
@@ -33,6 +32,7 @@ from synthetic_btf import (
     sample_texels,
     with_the_truths_tangents,
 )
+from matplotlib.colors import LogNorm
 
 from reflfield.alignment import align
 from reflfield.report.plots import SERIES_COLOURS
@@ -46,16 +46,16 @@ STAGES = {"harmonic": False, "refined": True}
 MEASURED = ("reflfield.alignment",)
 
 
-class Found(NamedTuple):
+class Recovered(NamedTuple):
     """Frames that one stage recovered, and what it took from the samples on."""
 
     local_from_base: np.ndarray
     seconds: np.ndarray  # wall time, and CPU time of all threads
 
 
-def part(found, texels):
+def part(stage, texels):
     """Frames of some texels."""
-    return found._replace(local_from_base=found.local_from_base[texels])
+    return stage._replace(local_from_base=stage.local_from_base[texels])
 
 
 def degraded(samples, noise, unobserved):
@@ -77,21 +77,21 @@ def clocks():
 
 def recovered(samples, directions, truth, n_threads):
     """Frames after each stage."""
-    found = {}
+    stages = {}
     for stage, refine in STAGES.items():
         start = clocks()
         result = align(samples, directions, directions, refine=refine, n_threads=n_threads)
         seconds = clocks() - start
         frames = with_the_truths_tangents(result.local_from_base, truth)
-        found[stage] = Found(frames, seconds)
-    return found
+        stages[stage] = Recovered(frames, seconds)
+    return stages
 
 
-def show(condition, found, truth, results):
+def show(condition, stages, truth, results):
     """Rows of the table of times and errors."""
-    for stage, (frames, seconds) in found.items():
+    for stage, (frames, seconds) in stages.items():
         normals, tangents = frame_errors(frames, truth)
-        wall, cpu = seconds - (found["harmonic"].seconds if stage == "refined" else 0.0)
+        wall, cpu = seconds - (stages["harmonic"].seconds if stage == "refined" else 0.0)
         print(
             f"| {condition} | {stage} | {wall:.1f} | {cpu:.1f} | {normals.mean():.3f} | "
             f"{np.median(normals):.3f} | {np.percentile(normals, 95):.3f} | "
@@ -132,10 +132,12 @@ def singular_values(matrix):
     return np.sqrt(squares[::-1].clip(0))
 
 
-def matrices(truth, found, directions):
+def matrices(truth, stages, directions):
     """The data matrix (texels, pairs of directions) unaligned and after each stage."""
     upright = np.tile(np.eye(3), (len(truth), 1, 1))
-    frames = {"unaligned": upright} | {name: one.local_from_base for name, one in found.items()}
+    frames = {"unaligned": upright} | {
+        name: one.local_from_base for name, one in stages.items()
+    }
     return {
         name: in_recovered_frames(truth, frame, directions) for name, frame in frames.items()
     }
@@ -155,12 +157,12 @@ def equal_components(values, stage, n=2):
 # --- figures --------------------------------------------------------------------------------
 
 
-def draw_matrix(truth, found, directions, width, path):
+def draw_matrix(truth, stages, directions, width, path):
     """Figure 4: the data matrix before and after, with zooms that show features line up."""
     height = len(truth) // width
     rows = (height // 4, height // 2, 3 * height // 4)
     texels = np.concatenate([np.arange(width) + row * width for row in rows])
-    some = {name: part(one, texels) for name, one in found.items()}
+    some = {name: part(one, texels) for name, one in stages.items()}
     shown = matrices(truth[texels], some, directions)
     top = np.percentile(shown["unaligned"], 99.5)
     figure, axes = pyplot.subplots(
@@ -205,11 +207,11 @@ def draw_singular_values(values, path, most=100):
     pyplot.close(figure)
 
 
-def draw_maps(truth, found, width, path):
+def draw_maps(truth, stages, width, path):
     """Figure 6: maps of normals and tangents, true and recovered, and their errors."""
     shape = (len(truth) // width, width)
     figure, axes = pyplot.subplots(4, 3, figsize=(14, 13), layout="constrained")
-    columns = {"true": truth} | {name: one.local_from_base for name, one in found.items()}
+    columns = {"true": truth} | {name: one.local_from_base for name, one in stages.items()}
     for column, (name, frames) in zip(axes.T, columns.items(), strict=True):
         normals = frames[:, 2].reshape(*shape, 3)
         column[0].imshow(0.5 + 0.5 * normals.clip(-1, 1))
@@ -239,12 +241,12 @@ def draw_maps(truth, found, width, path):
     pyplot.close(figure)
 
 
-def draw(truth, found, directions, width, folder, results):
+def draw(truth, stages, directions, width, folder, results):
     """All figures, and the count of components."""
     some = np.unique(np.linspace(0, len(truth) - 1, min(MATRIX_TEXELS, len(truth))).astype(int))
     sampled = matrices(
         truth[some],
-        {name: part(one, some) for name, one in found.items()},
+        {name: part(one, some) for name, one in stages.items()},
         directions,
     )
     values = {name: singular_values(matrix) for name, matrix in sampled.items()}
@@ -258,9 +260,9 @@ def draw(truth, found, directions, width, folder, results):
             f"energy, as {equal_components(values, stage)} unaligned ones"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    draw_matrix(truth, found, directions, width, folder / "figure_4_data_matrix.png")
+    draw_matrix(truth, stages, directions, width, folder / "figure_4_data_matrix.png")
     draw_singular_values(values, folder / "figure_5_singular_values.png")
-    draw_maps(truth, found, width, folder / "figure_6_maps.png")
+    draw_maps(truth, stages, width, folder / "figure_6_maps.png")
     print(folder)
 
 
@@ -274,7 +276,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("synthetic_btf"))
     options = parser.parse_args()
     truth, directions = relief_frames(*options.size), dome_directions()
-    results = Results("align_synthetic_btf", "The paper's synthetic scene", MEASURED)
+    results = Results("synthetic_btf", "The paper's synthetic scene", MEASURED)
     results.table(f"{len(truth)} texels, errors in degrees")
     samples = sample_texels(truth, directions, directions)
     # Compile the kernels before the clock starts.
