@@ -54,7 +54,7 @@ from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
-from reflfield.pipeline.cache import plain
+from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import working_bytes, writers_at_once
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
@@ -240,13 +240,29 @@ class HalfVectorFit:
     @property
     def pixel_share(self) -> float:
         """Share of the pixels that are fitted to."""
+        return min(1.0, *self._most_pixels)
+
+    @property
+    def memory_warnings(self) -> list[str]:
+        """Says so where it is the ceiling of memory that leaves pixels out."""
+        in_time, in_memory = self._most_pixels
+        if in_memory >= min(1.0, in_time):
+            return []
+        return [
+            f"fit to the photographs: {in_memory:.0%} of the pixels, drawn at random, were "
+            "fitted to, since all do not fit below the ceiling of memory"
+        ]
+
+    @cached_property
+    def _most_pixels(self) -> tuple[float, float]:
+        """Shares of the pixels that time and memory allow; above 1 where they allow more."""
         training, silhouettes = self.context.training, results.silhouettes(self.context)
         covered = [np.count_nonzero(silhouette >= LEAST_COVERAGE) for silhouette in silhouettes]
         n_photographs = (training.photograph_index >= 0).sum(axis=1)
         n_values = int(np.dot(covered, n_photographs))
         n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
         in_memory = working_bytes(self.context) * PIXELS_SHARE
-        return min(1.0, MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
+        return MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1)
 
     def allocator(
         self, views: Sequence[ViewPixels], n_lobes: int, folder: Path
@@ -438,6 +454,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
+        WARNINGS: fit.memory_warnings,
         **(lobe_counts(fit, folder) if on_hull else {}),
         "saturated values, fitted as bounds from below": fitted.n_bounds,
         "of them fitted darker": fitted.n_unmet,

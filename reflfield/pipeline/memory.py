@@ -28,7 +28,7 @@ BASE_BYTES = 512 << 20
 PHOTOGRAPH_BYTES = 48
 # A pixel of a held-out photograph while it is compared, with a baseline's image beside the
 # field's, and shown in the report; and of the strip that is measured, besides.
-HELD_OUT_BYTES, STRIP_BYTES = 62, 500
+HELD_OUT_BYTES, STRIP_BYTES = 50, 500
 # What compiling the kernels of a first run leaves in memory, before photographs are compared.
 COMPILED_BYTES = 400 << 20
 # A pixel of a silhouette while it is made from photographs.
