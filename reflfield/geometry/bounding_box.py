@@ -32,6 +32,7 @@ def object_bounds(views: Sequence[View], tolerance: int) -> tuple[Array, Array]:
     Among ``tolerance + 1`` groups of views at least one has no view that contradicts
     a point of the hull, so the boxes of the groups' own hulls together hold it.
     """
+    _check_places(views)
     origin, scale = _whereabouts(views)
     n_groups = tolerance + 1
     boxes = [_box(views[group::n_groups], origin, scale) for group in range(n_groups)]
@@ -88,7 +89,6 @@ def _whereabouts(views: Sequence[View]) -> tuple[Array, float]:
 
     The box is sought in these units, in which the solver's tolerances make sense.
     """
-    _check_places(views)
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         middle = 0.5 * (view.outline.outline.min(axis=0) + view.outline.outline.max(axis=0))

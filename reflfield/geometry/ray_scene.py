@@ -229,7 +229,7 @@ def row_strips(camera: Camera) -> list[tuple[int, int]]:
 
     Examples
     --------
-    >>> camera = Camera("v", "opencv", 4096, 300, 9.0, 9.0, 2048.0, 150.0, np.eye(4))
+    >>> camera = Camera("v", "opencv", 4096, 300, 99.0, 99.0, 2048.0, 150.0, np.eye(4))
     >>> row_strips(camera)
     [(0, 128), (128, 256), (256, 300)]
     """

@@ -15,7 +15,7 @@ from reflfield.field.file import open_field, write_field
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.pipeline import results
 from reflfield.pipeline.alignment import aligned_frames
-from reflfield.pipeline.cache import plain
+from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.completion import completion_of
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.half_vector_fit import write_half_vector_field
@@ -33,8 +33,9 @@ def write_compression(context: Context, folder: Path) -> dict[str, Any]:
         counts = write_half_vector_field(context, folder)
     else:
         counts = write_clustered_field(context, folder)
-    field = open_field(folder / "field.rfld")
-    return {**counts, **saturation_counts(context.refined, field)}
+    told = saturation_counts(context.refined, open_field(folder / "field.rfld"))
+    warnings = [*counts.get(WARNINGS, ()), *told.get(WARNINGS, ())]
+    return {**counts, **told, WARNINGS: warnings}
 
 
 def write_clustered_field(context: Context, folder: Path) -> dict[str, Any]:

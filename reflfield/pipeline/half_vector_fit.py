@@ -253,14 +253,30 @@ class HalfVectorFit:
     @property
     def pixel_share(self) -> float:
         """Share of the pixels that are fitted to."""
+        return min(1.0, *self._most_pixels)
+
+    @property
+    def memory_warnings(self) -> list[str]:
+        """Says so where it is the ceiling of memory that leaves pixels out."""
+        in_time, in_memory = self._most_pixels
+        if in_memory >= min(1.0, in_time):
+            return []
+        return [
+            f"fit to the photographs: {in_memory:.0%} of the pixels, drawn at random, were "
+            "fitted to, since all do not fit below the ceiling of memory"
+        ]
+
+    @cached_property
+    def _most_pixels(self) -> tuple[float, float]:
+        """Shares of the pixels that time and memory allow; above 1 where they allow more."""
         training, silhouettes = self.context.training, results.silhouettes(self.context)
         covered = [np.count_nonzero(silhouette >= LEAST_COVERAGE) for silhouette in silhouettes]
         n_photographs = (training.photograph_index >= 0).sum(axis=1)
         n_values = int(np.dot(covered, n_photographs))
         n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
         in_memory = working_bytes(self.context) * PIXELS_SHARE
-        of_values = min(MOST_PIXELS / max(n_values, 1), in_memory / max(n_bytes, 1))
-        return min(1.0, of_values, MOST_FOOTPRINTS / max(sum(covered), 1))
+        in_time = min(MOST_PIXELS / max(n_values, 1), MOST_FOOTPRINTS / max(sum(covered), 1))
+        return in_time, in_memory / max(n_bytes, 1)
 
     def allocator(
         self, views: Sequence[ViewPixels], n_lobes: int, folder: Path
@@ -452,6 +468,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
+        WARNINGS: fit.memory_warnings,
         **(lobe_counts(fit, folder) if on_hull else {}),
         "saturated values, fitted as bounds from below": fitted.n_bounds,
         "of them fitted darker": fitted.n_unmet,

@@ -27,7 +27,7 @@ BASE_BYTES = 512 << 20
 PHOTOGRAPH_BYTES = 48
 # A pixel of a held-out photograph while it is compared, with a baseline's image beside the
 # field's, and shown in the report; and of the strip that is measured, besides.
-HELD_OUT_BYTES, STRIP_BYTES = 62, 500
+HELD_OUT_BYTES, STRIP_BYTES = 50, 500
 # What compiling the kernels of a first run leaves in memory, before photographs are compared.
 COMPILED_BYTES = 400 << 20
 # A pixel of a silhouette while it is made from photographs.
@@ -150,7 +150,7 @@ def writer_bytes(n_texels: int, pairs: PhotographedPairs) -> int:
 def writers_at_once(context: Context) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
     n_texels = len(results.texels(context))
-    samples = writer_bytes(n_texels, results.observed(context).pairs)
+    samples = writer_bytes(n_texels, PhotographedPairs.of(context.training))
     pixels = max(camera.width * camera.height for camera in context.training.cameras)
     photographs = max(WRITER_COPIES * context.resources.block_bytes, PHOTOGRAPH_BYTES * pixels)
     free = context.resources.max_memory - BASE_BYTES - n_texels * TEXEL_BYTES

@@ -1,6 +1,7 @@
 """Image files: what goes in comes out, and damage is named."""
 
 import sys
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -49,6 +50,14 @@ class TestExr:
         assert back.dtype == np.float32
         np.testing.assert_array_equal(back, stored.astype(np.float32))
         assert image_size(tmp_path / "a.exr") == (7, 5)
+
+    def test_large_images_are_not_copied(self, tmp_path):
+        image = np.zeros((500, 500, 3), np.float32)
+        tracemalloc.start()
+        write_exr(tmp_path / "a.exr", image)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 0.5 * image.nbytes
 
     def test_same_bytes_twice(self, tmp_path, photograph):
         for name in ("a.exr", "b.exr"):

@@ -308,7 +308,7 @@ class TestOptions:
             (("--from", "hulls"), ("--from", "silhouettes, hull", "'hulls'")),
             (("--until", "hulls"), ("--until", "silhouettes, hull", "'hulls'")),
             (("--from", "report", "--until", "hull"), ("--from", "--until", "report", "hull")),
-            (("--format", "colmap"), ("format", "native", "'colmap'")),
+            (("--format", "metashapes"), ("format", "native", "'metashapes'")),
         ],
     )
     def test_arguments(self, run_tiny, refused, tmp_path, words, expected):

@@ -1,6 +1,8 @@
 """Baselines and kinds of errors of a run and of `compare`: in metrics, console and page."""
 
 import json
+import weakref
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from reflfield.capture.readers import open_capture
 from reflfield.metrics.error_kinds import KINDS
 from reflfield.metrics.image_errors import psnr
 from reflfield.options import HoldOut
+from reflfield.pipeline import error_analysis
 from reflfield.pipeline.hold_out import split_of
 from reflfield.render.exposure import display, object_pixels
 
@@ -94,6 +97,29 @@ def test_compare_says_that_there_are_no_photographs_of_the_field(
     assert set(without["baselines"]) & set(NAMES) == {"black", "mean_texture"}
     outcome = reflfield(*words, "-o", tmp_path / "with", "--photographs", tiny_capture)
     assert outcome.status == 0, outcome.err
-    metrics = json.loads((tmp_path / "with" / "metrics.json").read_text())
-    assert len(metrics["baselines"]["nearest_photograph"]["frames"]) == 2
-    assert metrics["baselines"]["black"] == without["baselines"]["black"]
+    found = json.loads((tmp_path / "with" / "metrics.json").read_text())
+    assert len(found["baselines"]["nearest_photograph"]["frames"]) == 2
+    assert found["baselines"]["black"] == without["baselines"]["black"]
+
+
+def test_one_image_of_a_baseline_is_held_at_a_time():
+    """Photographs may have as many pixels as fit in memory a few times."""
+    made = []
+
+    def images(*_):
+        for name in ("black", "nearest_photograph"):
+            assert all(image() is None for image in made)
+            image = np.zeros((4, 4, 3), np.float32)
+            made.append(weakref.ref(image))
+            yielded, image = image, None
+            yield name, yielded
+            del yielded
+
+    baselines = SimpleNamespace(nearest_to=lambda *_: None, images=images)
+    photograph = SimpleNamespace(camera=0, light=0, name="a")
+    frames = SimpleNamespace(photographs=[photograph], cameras=[None], lights=[None])
+    pairs = SimpleNamespace(frames=frames, read=lambda _: None)
+    scores = SimpleNamespace(add=lambda *_: None)
+    analyser = error_analysis.Analyser(baselines, None)
+    error_analysis._analyse_one(analyser, pairs, 0, scores, None)
+    assert len(made) == 2

@@ -155,6 +155,18 @@ def test_pixels_are_drawn_evenly_and_all_where_all_fit(rng):
         assert abs(drawn[part].sum() - 0.25 * n) < 5 * np.sqrt(n * 0.25 * 0.75)
 
 
+@pytest.mark.parametrize(
+    ("in_time", "in_memory", "said"),
+    [(2.0, 0.25, ["25% of the pixels"]), (0.1, 0.25, []), (2.0, 1.5, [])],
+)
+def test_pixels_left_out_for_want_of_memory_are_told(in_time, in_memory, said):
+    fit = half_vector_fit.HalfVectorFit(None)
+    fit.__dict__["_most_pixels"] = in_time, in_memory
+    assert fit.pixel_share == min(1.0, in_time, in_memory)
+    assert len(fit.memory_warnings) == len(said)
+    assert all(text in line for text, line in zip(said, fit.memory_warnings, strict=True))
+
+
 @pytest.mark.slow
 def test_a_third_of_the_pixels_gives_nearly_the_same_field(
     made, tiny_capture, tmp_path, monkeypatch
