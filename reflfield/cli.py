@@ -438,7 +438,7 @@ def convert(
 ) -> None:
     """Write a capture, or a .btf, in another format; what that cannot say is refused."""
     from reflfield.api.captures import convert_btf, convert_capture, open_capture
-    from reflfield.capture.conversion import holds_btf
+    from reflfield.capture.btf_means import holds_btf
 
     if to == "native" and holds_btf(capture):
         with working():

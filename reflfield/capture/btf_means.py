@@ -12,16 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from reflfield.capture.btf import MOST_DIRECTIONS, Btf
+from reflfield.capture.btf import MOST_DIRECTIONS, SUFFIX, Btf
 from reflfield.errors import CaptureError
 from reflfield.util.files import read_bytes
 
 DIRECTIONS, PATTERN = "xyz_loc.bin", "*_mean_std.bin"
 
 
-def holds_means(folder: Path) -> bool:
-    """Whether a folder holds means and their directions."""
-    return (folder / DIRECTIONS).is_file() and any(folder.glob(PATTERN))
+def holds_btf(path: Path) -> bool:
+    """Whether a path is a BTF container or a folder of means, not a capture."""
+    means = (path / DIRECTIONS).is_file() and any(path.glob(PATTERN))
+    return means or path.suffix.lower() == SUFFIX
 
 
 def read_btf_means(folder: Path) -> Btf:

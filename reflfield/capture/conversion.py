@@ -9,9 +9,9 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from reflfield.capture.btf import SUFFIX, read_btf
+from reflfield.capture.btf import read_btf
 from reflfield.capture.btf_conversion import write_btf_samples
-from reflfield.capture.btf_means import holds_means, read_btf_means
+from reflfield.capture.btf_means import read_btf_means
 from reflfield.capture.capture import Capture
 from reflfield.capture.colmap_writing import colmap_description
 from reflfield.capture.native_writing import native_description
@@ -88,11 +88,6 @@ def convert_btf(path: Path | str, out: Path | str) -> int:
     _check_empty(out)
     btf = read_btf_means(path) if path.is_dir() else read_btf(path)
     return write_btf_samples(btf, out, printable(path.stem) or "btf")
-
-
-def holds_btf(path: Path) -> bool:
-    """Whether a path is a BTF container or a folder of means, not a capture."""
-    return path.suffix.lower() == SUFFIX or holds_means(path)
 
 
 def _check_empty(out: Path) -> None:

@@ -38,6 +38,7 @@ from reflfield.capture.fixed_view import (
     photographs_beside,
 )
 from reflfield.capture.image_files import image_size
+from reflfield.capture.names import IMAGE_SUFFIXES
 from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError
 from reflfield.util.quoting import quoted
@@ -56,8 +57,11 @@ def is_light_list(path: Path) -> bool:
     """Whether a file is a list of lights; one above counts for a folder with photographs."""
     if not path.is_file():
         return False
-    folder = path.parent
-    return folder.name != ".." or any(f.is_file() for f in folder.parent.glob("*.[pjtPJT]*"))
+    if path.parent.name != "..":
+        return True
+    folder = path.parent.parent
+    own = any((folder / name).is_file() for name in (DIRECTIONS, LIGHTS))
+    return not own and any(f.suffix.lower() in IMAGE_SUFFIXES for f in folder.iterdir())
 
 
 def read_light_list(description: Path, *, follow_links: bool = False) -> Capture:

@@ -9,7 +9,8 @@ from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
-from reflfield.capture import btf, middlebury, native, transforms_json
+from reflfield.capture import middlebury, native, transforms_json
+from reflfield.capture.btf_means import holds_btf
 from reflfield.capture.capture import Capture
 from reflfield.capture.capture_formats import OTHER_READERS, OWN_READERS, READERS, Reader
 from reflfield.capture.consistency import (
@@ -26,6 +27,7 @@ from reflfield.capture.plausibility import check_code_range, far_lights, oblong_
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
 from reflfield.util.files import check_regular
+from reflfield.util.quoting import listed
 
 _logger = logging.getLogger(__name__)
 
@@ -77,6 +79,7 @@ def open_capture(
         raise CaptureError(
             f"{path}: expected a capture's folder or description; does not exist"
         )
+    _refuse_btf(path)
     if path.is_dir():
         description, kind = _description_in(path, format)
     else:
@@ -85,6 +88,8 @@ def open_capture(
     table = light_table_of(capture)
     if table is not None:
         capture = with_lights(capture, table, follow_links=follow_links)
+    if path.is_dir() and format is None and kind in OWN_READERS:
+        capture = replace(capture, notes=(*capture.notes, *_beside(path, description)))
     capture = capture.read_as(reading)
     check_environments(capture)
     if require_photographs:
@@ -150,7 +155,6 @@ def _descriptions(
 
 def _kind_of_file(path: Path) -> str:
     """Format of a description file, by its name and by what it holds."""
-    _refuse_btf(path)
     for name, reader in OTHER_READERS.items():
         ends = {pattern.rpartition("/")[2] for pattern in reader.patterns}
         if any(fnmatch(path.name, end) for end in ends) and reader.recognises(path):
@@ -177,8 +181,19 @@ def _kind_of_file(path: Path) -> str:
 
 def _refuse_btf(path: Path) -> None:
     """Say how a BTF container becomes a capture."""
-    if path.suffix.lower() == btf.SUFFIX:
+    if holds_btf(path):
         raise CaptureError(
             f"{path}: expected a capture, received a BTF container; write it as one first, "
             f"with `reflfield convert {path.name} -o FOLDER`"
         )
+
+
+def _beside(folder: Path, description: Path) -> tuple[str, ...]:
+    """A note on what other programs left beside a description that is made for captures."""
+    others = [file.name for file, _ in _descriptions(folder, None, OTHER_READERS)]
+    if not others:
+        return ()
+    return (
+        f"{description}: {listed(others)} beside it, which other programs left, is not read; "
+        "name the file to read it instead",
+    )

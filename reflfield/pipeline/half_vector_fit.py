@@ -468,7 +468,6 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
-        WARNINGS: fit.memory_warnings,
         **(lobe_counts(fit, folder) if on_hull else {}),
         "saturated values, fitted as bounds from below": fitted.n_bounds,
         "of them fitted darker": fitted.n_unmet,
@@ -480,7 +479,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "relative error of their cube roots": error.cube_root,
         "LDR PSNR of the samples, dB": error.psnr_ldr,
         "samples measured": error.n_samples,
-        WARNINGS: list(beside_the_view(*fit.light_angles)),
+        WARNINGS: [*fit.memory_warnings, *beside_the_view(*fit.light_angles)],
     }
 
 

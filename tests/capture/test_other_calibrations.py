@@ -289,7 +289,9 @@ def test_guanyu_is_as_its_transforms(shared_data):
 
 
 def test_a_capture_of_our_own_counts_before_other_programs_files(shared_data):
-    assert open_capture(shared_data("mia_guanyu_flash")).format == "transforms"
+    capture = open_capture(shared_data("mia_guanyu_flash"))
+    assert capture.format == "transforms"
+    assert any("guan-yu-replicability.vset beside it" in note for note in capture.notes)
 
 
 # --- LLFF ---------------------------------------------------------------------------------

@@ -62,6 +62,9 @@ def test_one_list_of_many_objects(tmp_path):
     with pytest.raises(CaptureError, match=r"several \(cat, owl\); open one of them"):
         open_capture(tmp_path)
     assert seen(open_capture(tmp_path / "owl"))[0] == NAMES
+    # a list of its own counts before the one above
+    (tmp_path / "owl/lights.txt").write_text(numbers(DIRECTIONS[::-1]))
+    np.testing.assert_allclose(seen(open_capture(tmp_path / "owl"))[1], DIRECTIONS[::-1])
 
 
 def test_diligent(tmp_path):
