@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -51,25 +52,12 @@ def test_light_that_the_object_sends_to_itself_is_found(
     psnr = {}
     for enabled in ("true", "false"):
         out = tmp_path / enabled
+        if enabled == "false":  # goes on from the stages that do not depend on it
+            shutil.copytree(tmp_path / "true", out)
         outcome = reflfield(
-            *(
-                "run",
-                amphora,
-                "-o",
-                out,
-                "--config",
-                tiny_options,
-                "--hold-out",
-                "views=1,lights=1",
-            ),
-            *(
-                "--set",
-                f"indirect.enabled={enabled}",
-                "--set",
-                "hull.resolution=48",
-                "--set",
-                "relighting.samples_per_pixel=4",
-            ),
+            *("run", amphora, "-o", out, "--config", tiny_options),
+            *("--hold-out", "views=1,lights=1", "--set", f"indirect.enabled={enabled}"),
+            *("--set", "hull.resolution=48", "--set", "relighting.samples_per_pixel=4"),
             *("--set", "comparison.without_alignment=false"),
             *("--set", "comparison.rate_distortion=false", "--until", "comparison"),
         )
