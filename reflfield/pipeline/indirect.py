@@ -49,7 +49,8 @@ def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
     read = partial(shade_rows, shade, reader.domain_unit)
     model = fit_indirect(read, training, context.training.n_lights, options.n_components)
     coefficients = np.zeros((reader.n_texels, len(model.variances)), np.float32)
-    for rows in np.array_split(np.arange(len(in_view)), max(1, len(in_view) // 1024)):
+    # Of the others nothing but the mean is known.
+    for rows in np.array_split(in_shade, max(1, len(in_shade) // 1024)):
         coefficients[in_view[rows]] = model.coefficients(read(rows))
     np.savez(folder / "indirect.npz", functions=model.functions(), coefficients=coefficients)
     return {
