@@ -22,7 +22,7 @@ from reflfield.util.progress import report
 SCENE = "demo_vase"
 HELD_OUT = HoldOut(views=2, lights=2)
 # The demo has to end within three minutes on two cores, compilation included: texels a little
-# coarser than usual. At 1.1 unseen views are 1.6 dB worse, at the usual 1.6 they are .3 dB better.
+# coarser than usual. At 1.1 unseen views are 1.6 dB worse, at the usual 1.6 .3 dB better.
 OPTIONS = PipelineOptions(
     texture=TextureOptions(texels_per_pixel=1.35),
     # Three materials; to find that by views left out would take a tenth of the time.

@@ -34,6 +34,8 @@ LEAST_IF_MEANT, LEAST_LEAD = 0.35, 0.25
 LEAST_AS_DESCRIBED, FEWEST_LOOKS = -0.05, 8
 # A hollow is an explanation if another reading leads by less.
 HOLLOW_TIE = 0.1
+# Light is from all sides where it comes in at so many degrees beside the view, or more.
+ALL_SIDES = 60.0
 # Normals at a smaller cosine to the way that a hollow opens are beside it.
 BESIDE = 0.7
 # Points of a photograph, and spread of their cosines, that say something.
@@ -230,3 +232,21 @@ def _of_camera(signs: Array) -> Reading:
         return turned + camera.centre if is_position else turned
 
     return reading
+
+
+def beside_the_view(low: float, high: float) -> Iterator[str]:
+    """Say it where all light came from near the cameras; angles in degrees.
+
+    Examples
+    --------
+    >>> list(beside_the_view(2.0, 150.0))
+    []
+    >>> next(beside_the_view(9.6, 9.8)).partition(";")[0]
+    'all light comes from 10 to 10 degrees beside the view'
+    """
+    if high < ALL_SIDES:
+        yield (
+            f"all light comes from {low:.0f} to {high:.0f} degrees beside the view; under "
+            "light from elsewhere the field shows what it continues those samples to, and no "
+            "more is known; photograph with lights apart from the camera, too"
+        )

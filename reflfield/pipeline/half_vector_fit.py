@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -52,6 +52,7 @@ from reflfield.fitting.texel_sample_fit import (
 )
 from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
+from reflfield.observations.light_agreement import beside_the_view
 from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import WARNINGS, plain
@@ -72,9 +73,8 @@ LOBE_TEXELS, USUAL_LOBES = 1024, 3
 TANGENT_ROUNDS = 2
 # Texels and quantile of their samples' luminance that is taken for white.
 WHITE_TEXELS, WHITE_QUANTILE = 1024, 0.995
-# Quantiles between which samples show how light comes in beside the view; light is from all
-# sides where they reach farther than so many degrees.
-ANGLE_QUANTILES, ALL_SIDES = (0.01, 0.99), 60.0
+# Quantiles between which samples show how light comes in beside the view.
+ANGLE_QUANTILES = (0.01, 0.99)
 # Rows of pixels that tables are fitted to; each has several texels.
 PIXEL_ROWS = TABLE_ROWS // 2
 # Share of the working memory for samples kept, for pixels, and for derivatives; what is larger
@@ -481,21 +481,3 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples measured": error.n_samples,
         WARNINGS: [*fit.memory_warnings, *beside_the_view(*fit.light_angles)],
     }
-
-
-def beside_the_view(low: float, high: float) -> Iterator[str]:
-    """Say it where all light came from near the cameras; angles in degrees.
-
-    Examples
-    --------
-    >>> list(beside_the_view(2.0, 150.0))
-    []
-    >>> next(beside_the_view(9.6, 9.8)).partition(";")[0]
-    'all light comes from 10 to 10 degrees beside the view'
-    """
-    if high < ALL_SIDES:
-        yield (
-            f"all light comes from {low:.0f} to {high:.0f} degrees beside the view; under "
-            "light from elsewhere the field shows what it continues those samples to, and no "
-            "more is known; photograph with lights apart from the camera, too"
-        )
