@@ -143,6 +143,16 @@ def working_bytes(context: Context) -> int:
     return max(ceiling - held, ceiling // 16)
 
 
+def readers_at_once(context: Context) -> int:
+    """Threads that may each read a photograph at a time while a fit holds what it is fitted to.
+
+    One has its place; half of the working memory is free for others, until there are
+    derivatives.
+    """
+    pixels = max(camera.width * camera.height for camera in context.training.cameras)
+    return 1 + int(working_bytes(context) // (2 * PHOTOGRAPH_BYTES * pixels))
+
+
 def writers_at_once(context: Context) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
     n_texels, n_views, n_lights = (
