@@ -57,7 +57,7 @@ from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
-from reflfield.pipeline.memory import working_bytes, writers_at_once
+from reflfield.pipeline.memory import readers_at_once, working_bytes
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.progress import report
@@ -234,7 +234,7 @@ class HalfVectorFit:
         surface = FieldSurface(self.build(model, 0.0))
         share, seed = self.pixel_share, context.options.seed
         # As many photographs at a time as the ceiling of memory allows.
-        readers = BoundedSemaphore(writers_at_once(context))
+        readers = BoundedSemaphore(readers_at_once(context))
 
         def one(view: int) -> ViewPixels:
             camera = context.training.cameras[view]

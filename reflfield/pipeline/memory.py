@@ -147,6 +147,16 @@ def writer_bytes(n_texels: int, pairs: PhotographedPairs) -> int:
     return chunk_shape(n_texels, pairs)[1] * n_texels * SAMPLE_BYTES
 
 
+def readers_at_once(context: Context) -> int:
+    """Threads that may each read a photograph at a time while a fit holds what it is fitted to.
+
+    One has its place; half of the working memory is free for others, until there are
+    derivatives.
+    """
+    pixels = max(camera.width * camera.height for camera in context.training.cameras)
+    return 1 + int(working_bytes(context) // (2 * PHOTOGRAPH_BYTES * pixels))
+
+
 def writers_at_once(context: Context) -> int:
     """Threads that may each hold the samples of a few views, and photographs, at a time."""
     n_texels = len(results.texels(context))

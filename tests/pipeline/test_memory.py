@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,16 @@ from reflfield.field.file import open_field
 from reflfield.observations.image_projection import Projection, project_photographs
 from reflfield.options import Resources, read_toml, with_tables
 from reflfield.pipeline import results
-from reflfield.pipeline.memory import check_memory, least_memory, within_memory
+from reflfield.pipeline.memory import (
+    BASE_BYTES,
+    COMPILED_BYTES,
+    PHOTOGRAPH_BYTES,
+    check_memory,
+    least_memory,
+    readers_at_once,
+    within_memory,
+    working_bytes,
+)
 from reflfield.pipeline.pipeline_options import PipelineOptions, TextureOptions
 from reflfield.pipeline.texel_columns import (
     BlockedColumns,
@@ -101,6 +111,19 @@ def test_blocks_of_pixels_follow_ceiling_and_threads():
     assert ample.block_pixels == 4096
     assert 64 <= tight.block_pixels < 1024
     assert tight.workers == 16
+
+
+@pytest.mark.parametrize("ceiling", [2, 3, 4, 8, 16])
+def test_photographs_read_at_a_time_fit_beside_what_a_fit_holds(ceiling):
+    camera = SimpleNamespace(width=4000, height=4000)
+    wanted = SimpleNamespace(
+        training=SimpleNamespace(cameras=[camera]), resources=Resources(2, ceiling * GB)
+    )
+    n = readers_at_once(wanted)
+    assert n >= 1
+    held = BASE_BYTES + COMPILED_BYTES + n * PHOTOGRAPH_BYTES * 4000**2
+    assert held + working_bytes(wanted) // 2 <= ceiling * GB
+    assert (n > 1) == (ceiling >= 4)
 
 
 class TestCeiling:
