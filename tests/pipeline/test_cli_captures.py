@@ -42,7 +42,7 @@ def test_followed_links(reflfield, linked):
     assert "photographs   6, 0 pairs missing" in outcome.out
 
 
-@pytest.mark.parametrize("command", ["run", "inspect", "compare", "relight"])
+@pytest.mark.parametrize("command", ["run", "inspect", "compare", "relight", "convert"])
 def test_every_command_that_opens_captures_follows_links(reflfield, command):
     assert "--follow-links" in reflfield(command, "--help").out
 
@@ -60,3 +60,16 @@ def test_notes_and_names_are_one_printable_line_each(reflfield, tmp_path):
     assert note.endswith(r"a\nb\x1b[2J/capture.json: not used: 'mood'")
     assert outcome.out.splitlines()[0].startswith(r"capture       a\nb\x1b[2J (native")
     assert all(line.isprintable() for line in outcome.out.splitlines())
+
+
+def test_convert(reflfield, tmp_path):
+    outcome = reflfield("convert", FROZEN, "-o", tmp_path / "out")
+    assert outcome.status == 0
+    assert outcome.out.startswith("6 photographs, 9 files in ")
+    assert reflfield("inspect", tmp_path / "out").status == 0
+    outcome = reflfield("convert", FROZEN, "-o", tmp_path / "other", "--to", "transforms")
+    assert outcome.status == 2
+    assert "received one of kind 'directional'; write it with --to native" in outcome.err
+    assert not (tmp_path / "other").exists()
+    outcome = reflfield("convert", FROZEN, "-o", tmp_path / "out")
+    assert outcome.err.startswith("reflfield: error: --out: expected a new or empty folder")
