@@ -229,7 +229,7 @@ class HalfVectorFit:
         return fit
 
     def pixels(self, model: HalfVectorModel, pool: ThreadPoolExecutor) -> list[ViewPixels]:
-        """Pixels of all views with the texels under them, as the field will be rendered."""
+        """Pixels of views with photographs, the texels under them as the field is rendered."""
         context, texels = self.context, results.texels(self.context)
         surface = FieldSurface(self.build(model, 0.0))
         share, seed = self.pixel_share, context.options.seed
@@ -248,7 +248,9 @@ class HalfVectorFit:
                     context.training, view, under, texels.position, self.reliable, self.white
                 )
 
-        return list(pool.map(one, range(context.training.n_views)))
+        # Of a view without a photograph only the silhouette is used.
+        photographed = np.unique(results.observed(context).pairs.view)
+        return list(pool.map(one, photographed.tolist()))
 
     @property
     def pixel_share(self) -> float:
