@@ -17,6 +17,7 @@ PACKAGES = (
     "sphere",
     "factorization",
     "capture",
+    "calibration",
     "geometry",
     "observations",
     "alignment",
@@ -27,10 +28,14 @@ PACKAGES = (
     "viewer",
     "export",
     "report",
+    "checking",
     "pipeline",
     "api",
     "demo",
     "flags",
+    "cli_options",
+    "cli_check",
+    "cli_lights",
     "cli",
     "__main__",
 )
@@ -38,6 +43,8 @@ PACKAGES = (
 # is heard while libraries are imported.
 IMPORTS_LATE = {
     Path("reflfield/cli.py"),
+    Path("reflfield/cli_check.py"),
+    Path("reflfield/cli_lights.py"),
     Path("reflfield/__main__.py"),
     Path("capture_sim/__main__.py"),
 }
