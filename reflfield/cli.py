@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -14,7 +13,19 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from reflfield import __version__
+from reflfield.cli_check import check
+from reflfield.cli_lights import lights
 from reflfield.cli_messages import say_metrics, say_results
+from reflfield.cli_options import (
+    EncodingOption,
+    FollowLinks,
+    Format,
+    LayerOption,
+    MaxMemory,
+    Out,
+    RaysPerPixel,
+    Workers,
+)
 from reflfield.errors import InputError, ReflfieldError
 from reflfield.flags import FLAGS, current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
@@ -33,44 +44,8 @@ app = typer.Typer(
 LONGEST_MESSAGE = 1600
 NOTHING_LEFT = "nothing half-written is left"
 GOES_ON = "the same command goes on where it stopped"
-
-
-def results_folder(name: str | Path) -> Path:
-    """Folder of a name; none and the root come of a variable of the shell that is not set."""
-    whole = Path(os.path.normpath(Path.cwd() / name))
-    if not str(name).strip() or whole == whole.parent:
-        raise typer.BadParameter(f"expected a folder for results, received {str(name)!r}")
-    return Path(name)
-
-
-Out = Annotated[
-    Path,
-    typer.Option(
-        "-o", "--out", metavar="FOLDER", parser=results_folder, help="Folder for the results."
-    ),
-]
-Format = Annotated[
-    str | None,
-    typer.Option(help="Such as colmap; detected by content if absent."),
-]
-FollowLinks = Annotated[
-    bool,
-    typer.Option("--follow-links", help="Read files that symbolic links lead to elsewhere."),
-]
-EncodingOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="linear|srgb|gamma=N|PAIRS.csv",
-        help="Of the photographs, instead of what the files say.",
-    ),
-]
-LayerOption = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Layer, part or page of the photographs' files."),
-]
-Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
-MaxMemory = Annotated[str, typer.Option(help="Ceiling of resident memory.")]
-RaysPerPixel = Annotated[int, typer.Option(help="A square number.")]
+app.command()(check)
+app.command()(lights)
 
 
 def main() -> None:

@@ -38,6 +38,11 @@ FLAGS = {
     "to": "--to",
     "out": "--out",
     "port": "--port",
+    "sphere": "--sphere",
+    "matt_sphere": "--matt-sphere",
+    "grey_card": "--grey-card",
+    "radius": "--radius",
+    "focal": "--focal",
 }
 # Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
 RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}

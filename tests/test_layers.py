@@ -17,6 +17,7 @@ PACKAGES = (
     "sphere",
     "factorization",
     "capture",
+    "calibration",
     "geometry",
     "observations",
     "alignment",
@@ -27,11 +28,15 @@ PACKAGES = (
     "viewer",
     "export",
     "report",
+    "checking",
     "pipeline",
     "api",
     "demo",
     "flags",
     "cli_messages",
+    "cli_options",
+    "cli_check",
+    "cli_lights",
     "cli",
     "__main__",
 )
@@ -40,6 +45,8 @@ PACKAGES = (
 IMPORTS_LATE = {
     Path("reflfield/cli.py"),
     Path("reflfield/cli_messages.py"),
+    Path("reflfield/cli_check.py"),
+    Path("reflfield/cli_lights.py"),
     Path("reflfield/__main__.py"),
     Path("capture_sim/__main__.py"),
 }

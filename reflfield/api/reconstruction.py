@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ from typing import Any
 from reflfield.api.captures import open_capture
 from reflfield.api.fields import Field, open_field
 from reflfield.capture.capture import Capture
+from reflfield.checking.quick_check import quick_check
 from reflfield.options import (
     HoldOut,
     Resources,
@@ -29,6 +31,8 @@ from reflfield.pipeline.quantisation_search import missed_quality
 from reflfield.pipeline.report import problems_of
 from reflfield.pipeline.stages import run
 from reflfield.util.nested_tables import merged
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,9 @@ def reconstruct(
         capture = open_capture(Path(capture).resolve(), test_split=held.test)
     if not isinstance(options, PipelineOptions):
         options = with_tables(PipelineOptions(), options or {})
+    for finding in quick_check(capture):
+        text = finding.line().partition(": ")[2]
+        log.warning("%s (`reflfield check` shows more)", text)
     context = run(
         *(capture, folder, options),
         hold_out=held,

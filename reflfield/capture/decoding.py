@@ -88,7 +88,9 @@ class StoredImage:
         return self.colour if top == 1 else self.colour.astype(np.float32) / np.float32(top)
 
 
-def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
+def decode_stored(
+    path: Path, header: ImageHeader, layer: Layer, factor: int = 1
+) -> StoredImage:
     """Decode one layer of a file.
 
     Parameters
@@ -98,6 +100,8 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
         What `read_header` says of it.
     layer : Layer
         What `choose_layer` chose.
+    factor : {1, 2, 4, 8}, optional
+        By which a JPEG is made smaller while it is decoded, in a fraction of the time.
 
     Returns
     -------
@@ -119,7 +123,10 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
         alpha = layer.alpha or _alpha_name(spec)
         _check_pixels(path, header, layer, spec)
         wanted = [*names, *([alpha] if alpha else [])]
-        pixels = _pixels(path, file, spec, header, layer, wanted)
+        small = _reduced_jpeg(path, spec, factor) if factor > 1 else None
+        pixels = small
+        if pixels is None:
+            pixels = _pixels(path, file, spec, header, layer, wanted)
         stated = partial(
             stated_space,
             path,
@@ -139,6 +146,24 @@ def decode_stored(path: Path, header: ImageHeader, layer: Layer) -> StoredImage:
         premultiplied=not straight,
         stated=stated,
     )
+
+
+def _reduced_jpeg(path: Path, spec: Any, factor: int) -> NDArray[Any] | None:
+    """A whole JPEG of one or three channels, smaller by a factor; None for other files."""
+    flags = {
+        1: {2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
+            8: cv2.IMREAD_REDUCED_GRAYSCALE_8},
+        3: {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4,
+            8: cv2.IMREAD_REDUCED_COLOR_8},
+    }.get(spec.nchannels, {})  # fmt: skip
+    content = path.read_bytes()
+    if factor not in flags or not content.endswith(b"\xff\xd9"):  # the end of a whole JPEG
+        return None
+    stored = np.frombuffer(content, np.uint8)
+    pixels = cv2.imdecode(stored, flags[factor] | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        return None
+    return pixels[..., None] if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., ::-1])
 
 
 @contextmanager

@@ -8,7 +8,7 @@ the wrong ones alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,23 +128,43 @@ def judge(views: Sequence[View], low: Array, high: Array) -> Verdict:
     Verdict
     """
     votes = votes_of(views, low, high)
-    everyone = list(range(len(views)))
-    evidence = first = gather(views, votes, everyone)
+    return set_aside(len(views), lambda some: gather(views, votes, some), CONTRADICTION)
+
+
+def set_aside(
+    n_views: int, evidence_of: Callable[[Sequence[int]], Evidence], most_uncovered: float
+) -> Verdict:
+    """Find the views that contradict all others, by evidence of any kind.
+
+    Parameters
+    ----------
+    n_views : int
+    evidence_of : callable
+        ``evidence_of(some)``: evidence of some of the views, in their order.
+    most_uncovered : float
+        Share that other views exclude of one which agrees with them.
+
+    Returns
+    -------
+    Verdict
+    """
+    everyone = list(range(n_views))
+    evidence = first = evidence_of(everyone)
     kept, aside = everyone, list[int]()
-    most = min(int(max(1, _LARGEST_MINORITY * len(views))), len(views) - _SMALLEST_MAJORITY)
-    while evidence.uncovered.max() > CONTRADICTION and len(aside) < most:
+    most = min(int(max(1, _LARGEST_MINORITY * n_views)), n_views - _SMALLEST_MAJORITY)
+    while evidence.uncovered.max() > most_uncovered and len(aside) < most:
         share = evidence.blame.sum(axis=0) + evidence.blame.sum(axis=1)
         aside.append(kept[int(share.argmax())])
         kept = [i for i in everyone if i not in aside]
-        evidence = gather(views, votes, kept)
-    agree = bool(evidence.uncovered.max() <= CONTRADICTION)
+        evidence = evidence_of(kept)
+    agree = bool(evidence.uncovered.max() <= most_uncovered)
     outliers = aside if agree else []
     for view in list(outliers) if len(outliers) > 1 else []:
         some = sorted([*kept, view])
-        if gather(views, votes, some).uncovered.max() <= CONTRADICTION:
+        if evidence_of(some).uncovered.max() <= most_uncovered:
             outliers.remove(view)
             kept = some
-    others = max(len(views) - 1, 1)
+    others = max(n_views - 1, 1)
     excluded = (first.blame.sum(axis=1) - np.diag(first.blame)) / others
     return Verdict(tuple(sorted(outliers)), agree, first.uncovered, excluded)
 

@@ -57,7 +57,7 @@ def image_plane(camera: Camera, silhouette: NDArray[np.floating] | None = None) 
     pixels = np.array([left, top]) + across * np.array([right - left, bottom - top])
     up = 1.0 if _faces_up(camera) else -1.0
     return Atlas(
-        positions=_on_plane(camera, pixels),
+        positions=on_plane(camera, pixels),
         faces=_grid_faces(cells),
         uv=np.stack([across[:, 0], 1.0 - across[:, 1]], axis=1),
         chart=np.zeros(2 * cells * cells, dtype=np.int32),
@@ -89,7 +89,7 @@ def _faces_up(camera: Camera) -> bool:
     return bool(camera.centre[2] > 0.0)
 
 
-def _on_plane(camera: Camera, pixels: Array) -> Array:
+def on_plane(camera: Camera, pixels: Array) -> Array:
     """Where the rays of pixels meet z = 0, (n, 3)."""
     origins, directions = camera.rays(pixels)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,0 +1,1 @@
+"""Lights from what they photographed: spheres and grey cards."""

@@ -1,0 +1,1 @@
+"""What is wrong with a capture, before anything is made of it."""
