@@ -17,7 +17,7 @@ from reflfield import __version__
 from reflfield.errors import InputError, ReflfieldError
 from reflfield.flags import FLAGS, current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
-from reflfield.util.terminal import say, say_error, showing_progress
+from reflfield.util.terminal import say, say_error, showing_progress, system_words
 
 # The libraries that do the work take seconds to import: commands import what they need,
 # so that --help and wrong arguments answer at once.
@@ -31,6 +31,7 @@ app = typer.Typer(
 )
 MISSED = 3  # status where the quality that was asked for is not reached
 LONGEST_MESSAGE = 1600
+FORMAT_NAMES = "html|gltf|blender|materialx|mitsuba|rti|exr|btf"
 NOTHING_LEFT = "nothing half-written is left"
 GOES_ON = "the same command goes on where it stopped"
 
@@ -88,14 +89,6 @@ def main() -> None:
     finally:
         notes.removeHandler(handler)
         notes.propagate = True
-
-
-def system_words(error: OSError) -> str:
-    """What the system says, and of which file; where it names none, of the working folder."""
-    named = str(error.filename or Path.cwd())
-    if error.filename2:
-        named = f"{named}, {error.filename2}"
-    return f"{named}: {error.strerror or error}"
 
 
 class Notes(logging.Handler):
@@ -244,6 +237,13 @@ def relight(
     light: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Direction to a distant light.")
     ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option(metavar="MESH", help="OBJ or GLB with UVs that a flat field covers."),
+    ] = None,
+    tile: Annotated[
+        float | None, typer.Option(help="Repetitions of the field along the UVs of MESH; 1.")
+    ] = None,
     rays_per_pixel: RaysPerPixel = 16,
     size: Annotated[
         int | None, typer.Option(help="Side of the turntable's images, pixels; 400.")
@@ -270,10 +270,13 @@ def relight(
                 "elevation_deg": elevation}  # fmt: skip
     refuse_without("--orbit; a capture brings its own cameras and lights", orbit, of_orbit)
     refuse_without("--environment MAP", environment, of_map)
+    refuse_without("--on MESH", on, {"tiles": tile})
     resources = limits(workers, max_memory)
     made_with = image_options(rays_per_pixel, resources)
     opened = open_field(field, max_memory=resources.max_memory)
     with working():
+        if on is not None:
+            opened = opened.on_mesh(on, 1.0 if tile is None else tile)
         if capture is not None:
             wanted = open_capture(
                 capture, format, follow_links=follow_links, require_photographs=False
@@ -381,16 +384,24 @@ def export(
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="FILE", help="Such as OBJECT.html.")
     ],
-    to: Annotated[str, typer.Option(metavar="html|gltf", help="Format of the file.")] = "html",
+    to: Annotated[str, typer.Option(metavar=FORMAT_NAMES, help="Format.")] = "html",
+    view: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Direction to the viewer, of rti.")
+    ] = None,
     max_memory: MaxMemory = "4GB",
 ) -> None:
-    """Write a field as one web page that shows and relights it, or its mesh as glTF."""
+    """Write a field in the format of other software; FILE is a folder for some."""
     from reflfield.api.fields import open_field
+    from reflfield.api.images import direction_of
     from reflfield.export.formats import export_field
     from reflfield.options import parse_bytes
 
-    export_field(open_field(field, max_memory=parse_bytes(max_memory)).stored, out, to)
-    say(str(out))
+    stored = open_field(field, max_memory=parse_bytes(max_memory)).stored
+    with working():
+        seen_from = None if view is None else direction_of("view", view)
+        lines = export_field(stored, out, to, seen_from)
+    for line in [*lines, str(out)]:
+        say(line)
 
 
 @app.command()
@@ -472,26 +483,12 @@ def say_results(result: Any, started: float) -> None:
 
 
 def say_metrics(metrics: dict[str, Any]) -> None:
-    """Mean metrics in one line, and on what they were measured in another."""
-    mean, n = metrics["mean"], len(metrics["frames"])
-    if not mean:
-        return
-    say(
-        f"{n} frame{'' if n == 1 else 's'}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
-        f"{mean['psnr_hdr']:.2f} dB (HDR), SSIM {mean['ssim']:.4f}, FLIP {mean['flip']:.4f}"
-    )
-    measured = metrics["measured"]
-    parts = [f"measured on {measured['pixels']} pixels"]
-    if left_out := measured["saturated_pixels_left_out"]:
-        parts.append(f"{left_out} saturated ones left out")
-    if names := measured["frames_not_measured"]:
-        parts.append(f"without a pixel of the object: {', '.join(names)}")
-    origins = ", ".join(f"{name} {n}" for name, n in measured["silhouettes"].items())
-    say("; ".join([*parts, f"silhouettes: {origins}"]))
-    from reflfield.report.sections import analysis_lines
+    """Mean metrics, what they were measured on, and what they are compared with."""
+    from reflfield.report.sections import analysis_lines, measured_lines
 
-    for line in analysis_lines(metrics):
-        say(with_flags(line))
+    if metrics["mean"]:
+        for line in (*measured_lines(metrics), *analysis_lines(metrics)):
+            say(with_flags(line))
 
 
 if __name__ == "__main__":

@@ -38,6 +38,9 @@ FLAGS = {
     "to": "--to",
     "out": "--out",
     "port": "--port",
+    "view": "--view",
+    "mesh": "--on",
+    "tiles": "--tile",
 }
 # Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
 RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}
