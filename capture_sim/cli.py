@@ -25,7 +25,7 @@ from rich.table import Table
 
 from capture_sim.dome import rig_presets
 from capture_sim.effects.registry import read_choice
-from capture_sim.errors import SceneError, shown
+from capture_sim.errors import SceneError, scene_error, shown
 from capture_sim.inputs import memory_limit
 from capture_sim.materials import material_presets
 from capture_sim.memory import parse_bytes
@@ -34,6 +34,7 @@ from capture_sim.open3d_library import load_open3d
 from capture_sim.plan import plan as make_plan
 from capture_sim.record import table_lines
 from capture_sim.scene import Scene, load_scene, shipped_scenes
+from capture_sim.transforms import FOLDER, described
 from capture_sim.write import MOST_WORKERS, write_capture
 
 app = typer.Typer(
@@ -88,8 +89,18 @@ def render(
             min=0, max=4096, help="Photographs to write each effect's contribution for."
         ),
     ] = 0,
+    as_: Annotated[
+        str | None,
+        typer.Option(
+            "--as",
+            metavar="transforms",
+            help="Add the splits that radiance-field software reads.",
+        ),
+    ] = None,
 ) -> None:
     """Simulate a capture: photographs, silhouettes, calibration and truth."""
+    if as_ not in (None, FOLDER):
+        raise scene_error("--as", FOLDER, as_, "leave it out for the native format alone")
     ceiling = parse_bytes(max_memory)
     with _interruptible("the same command goes on from here"), memory_limit(ceiling):
         loaded = _loaded(scene, effects)
@@ -103,9 +114,11 @@ def render(
                 max_memory=ceiling,
                 overwrite=overwrite,
                 n_contributions=contributions,
+                as_transforms=as_ is not None,
                 progress=_shown_by(bar),
             )
-    for line in [*table_lines(output), f"Wrote {output}"]:
+    splits = described(output) if as_ else ()
+    for line in [*table_lines(output), f"Wrote {output}", *splits]:
         _console().print(line, highlight=False, soft_wrap=True, markup=False)
 
 

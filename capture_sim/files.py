@@ -83,10 +83,24 @@ def write_exr(path: Path, radiance: NDArray[np.float32]) -> None:
     radiance : (h, w, 3) float32
     """
     fits = float(np.abs(radiance).max(initial=0.0)) <= _LARGEST_HALF
-    pixels = np.ascontiguousarray(radiance, dtype=np.float16 if fits else np.float32)
+    _write_channels(path, "RGB", radiance.astype(np.float16 if fits else np.float32))
+
+
+def write_rgba_exr(path: Path, pixels: NDArray[Any]) -> None:
+    """Write radiance over black and alpha as they are.
+
+    Parameters
+    ----------
+    path : Path
+    pixels : (h, w, 4) float16 or float32
+    """
+    _write_channels(path, "RGBA", pixels)
+
+
+def _write_channels(path: Path, names: str, pixels: NDArray[Any]) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
-        with OpenEXR.File(header, {"RGB": pixels}) as file:
+        with OpenEXR.File(header, {names: np.ascontiguousarray(pixels)}) as file:
             file.write(str(path))
     except RuntimeError as failure:  # with the system's words at the end
         codes = (code for code in errno.errorcode if os.strerror(code) in str(failure))

@@ -96,6 +96,20 @@ def _light_intensity(light: Table) -> Array:
     return _FAR**2 * np.asarray(light["irradiance"], dtype=np.float64)
 
 
+def point_light(light: Table, centre: Array) -> dict[str, Any]:
+    """Point light that stands for a light; one at infinity is put far away.
+
+    Parameters
+    ----------
+    light : dict
+        Point or directional light of the native capture format.
+    centre : (3,) float64
+        Of the object, metres.
+    """
+    position, intensity = _light_position(light, centre), _light_intensity(light)
+    return {"type": "point", "position": position.tolist(), "intensity": intensity.tolist()}
+
+
 def _mixture(
     positions: Array,
     centre: Array,

@@ -42,6 +42,7 @@ from capture_sim.rays import RayTracer
 from capture_sim.record import write_record
 from capture_sim.render import traced_lights
 from capture_sim.stopwatch import Stopwatch
+from capture_sim.transforms import check_transforms, write_transforms
 from capture_sim.truth import write_truth, write_view_truth
 from capture_sim.view_samples import sample_view
 from capture_sim.visibility import TracedLights
@@ -64,6 +65,7 @@ def write_capture(
     max_memory: int | None = None,
     overwrite: bool = False,
     n_contributions: int = 0,
+    as_transforms: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Simulate a scene and write its photographs and truth.
@@ -84,6 +86,8 @@ def write_capture(
         True to replace an earlier capture there; anything else is kept.
     n_contributions : int
         Photographs for which it is written what each effect contributed to them.
+    as_transforms : bool
+        True to add ``transforms/``; see `capture_sim.transforms`.
     progress : callable, optional
         Called with the photographs done and their total number, by any thread but by one
         at a time.
@@ -96,13 +100,15 @@ def write_capture(
     Raises
     ------
     SceneError
-        If the folder exists and may not be replaced, another process writes to it, or the
-        memory does not suffice.
+        If the folder exists and may not be replaced, another process writes to it, the
+        memory does not suffice, or ``transforms/`` cannot hold the scene.
     OSError
         If a file cannot be written; names it.
     """
     target, mark = Path(os.path.abspath(folder)), fingerprint(scene)  # noqa: PTH100
     check_workers(workers)
+    if as_transforms:
+        check_transforms(scene)
     with reserved(target) as part:
         known = begun_for(part) == mark
         if finish(part, target) and known:
@@ -117,6 +123,8 @@ def write_capture(
         begin(part, mark)
         _write_views(setup, tracer, part, workers, progress or _no_progress)
         _write_rest(setup, tracer, part, n_contributions)
+        if as_transforms:
+            write_transforms(setup, part)
         publish(part, target, overwrite=overwrite)
     return folder
 

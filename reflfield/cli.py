@@ -29,7 +29,7 @@ from reflfield.cli_options import (
 from reflfield.errors import InputError, ReflfieldError
 from reflfield.flags import FLAGS, current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
-from reflfield.util.terminal import say, say_error, showing_progress
+from reflfield.util.terminal import say, say_error, showing_progress, system_words
 
 # The libraries that do the work take seconds to import: commands import what they need,
 # so that --help and wrong arguments answer at once.
@@ -42,6 +42,7 @@ app = typer.Typer(
     help="Dome photographs to relightable objects.",
 )
 LONGEST_MESSAGE = 1600
+FORMAT_NAMES = "html|gltf|blender|materialx|mitsuba|rti|exr|btf"
 NOTHING_LEFT = "nothing half-written is left"
 GOES_ON = "the same command goes on where it stopped"
 app.command()(check)
@@ -63,14 +64,6 @@ def main() -> None:
     finally:
         notes.removeHandler(handler)
         notes.propagate = True
-
-
-def system_words(error: OSError) -> str:
-    """What the system says, and of which file; where it names none, of the working folder."""
-    named = str(error.filename or Path.cwd())
-    if error.filename2:
-        named = f"{named}, {error.filename2}"
-    return f"{named}: {error.strerror or error}"
 
 
 class Notes(logging.Handler):
@@ -219,6 +212,13 @@ def relight(
     light: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Direction to a distant light.")
     ] = None,
+    on: Annotated[
+        Path | None,
+        typer.Option(metavar="MESH", help="OBJ or GLB with UVs that a flat field covers."),
+    ] = None,
+    tile: Annotated[
+        float | None, typer.Option(help="Repetitions of the field along the UVs of MESH; 1.")
+    ] = None,
     rays_per_pixel: RaysPerPixel = 16,
     size: Annotated[
         int | None, typer.Option(help="Side of the turntable's images, pixels; 400.")
@@ -245,10 +245,13 @@ def relight(
                 "elevation_deg": elevation}  # fmt: skip
     refuse_without("--orbit; a capture brings its own cameras and lights", orbit, of_orbit)
     refuse_without("--environment MAP", environment, of_map)
+    refuse_without("--on MESH", on, {"tiles": tile})
     resources = limits(workers, max_memory)
     made_with = image_options(rays_per_pixel, resources)
     opened = open_field(field, max_memory=resources.max_memory)
     with working():
+        if on is not None:
+            opened = opened.on_mesh(on, 1.0 if tile is None else tile)
         if capture is not None:
             wanted = open_capture(
                 capture, format, follow_links=follow_links, require_photographs=False
@@ -356,16 +359,24 @@ def export(
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="FILE", help="Such as OBJECT.html.")
     ],
-    to: Annotated[str, typer.Option(metavar="html|gltf", help="Format of the file.")] = "html",
+    to: Annotated[str, typer.Option(metavar=FORMAT_NAMES, help="Format.")] = "html",
+    view: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Direction to the viewer, of rti.")
+    ] = None,
     max_memory: MaxMemory = "4GB",
 ) -> None:
-    """Write a field as one web page that shows and relights it, or its mesh as glTF."""
+    """Write a field in the format of other software; FILE is a folder for some."""
     from reflfield.api.fields import open_field
+    from reflfield.api.images import direction_of
     from reflfield.export.formats import export_field
     from reflfield.options import parse_bytes
 
-    export_field(open_field(field, max_memory=parse_bytes(max_memory)).stored, out, to)
-    say(str(out))
+    stored = open_field(field, max_memory=parse_bytes(max_memory)).stored
+    with working():
+        seen_from = None if view is None else direction_of("view", view)
+        lines = export_field(stored, out, to, seen_from)
+    for line in [*lines, str(out)]:
+        say(line)
 
 
 @app.command()

@@ -31,23 +31,9 @@ def say_results(result: Any, started: float) -> None:
 
 
 def say_metrics(metrics: dict[str, Any]) -> None:
-    """Mean metrics in one line, and on what they were measured in another."""
-    mean, n = metrics["mean"], len(metrics["frames"])
-    if not mean:
-        return
-    say(
-        f"{n} frame{'' if n == 1 else 's'}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
-        f"{mean['psnr_hdr']:.2f} dB (HDR), SSIM {mean['ssim']:.4f}, FLIP {mean['flip']:.4f}"
-    )
-    measured = metrics["measured"]
-    parts = [f"measured on {measured['pixels']} pixels"]
-    if left_out := measured["saturated_pixels_left_out"]:
-        parts.append(f"{left_out} saturated ones left out")
-    if names := measured["frames_not_measured"]:
-        parts.append(f"without a pixel of the object: {', '.join(names)}")
-    origins = ", ".join(f"{name} {n}" for name, n in measured["silhouettes"].items())
-    say("; ".join([*parts, f"silhouettes: {origins}"]))
-    from reflfield.report.sections import analysis_lines
+    """Mean metrics, what they were measured on, and what they are compared with."""
+    from reflfield.report.sections import analysis_lines, measured_lines
 
-    for line in analysis_lines(metrics):
-        say(with_flags(line))
+    if metrics["mean"]:
+        for line in (*measured_lines(metrics), *analysis_lines(metrics)):
+            say(with_flags(line))

@@ -43,6 +43,9 @@ FLAGS = {
     "grey_card": "--grey-card",
     "radius": "--radius",
     "focal": "--focal",
+    "view": "--view",
+    "mesh": "--on",
+    "tiles": "--tile",
 }
 # Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
 RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}

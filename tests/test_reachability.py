@@ -37,6 +37,21 @@ ALLOWED = {
     ("reflfield/pipeline/cache.py", "blocks_computed"): "written into the record of a stage",
     ("reflfield/pipeline/cache.py", "blocks_resumed"): "written into the record of a stage",
     ("reflfield/pipeline/cache.py", "blocks_repeated"): "written into the record of a stage",
+    ("reflfield/export/blender_scene/build_object.py", "default_value"): "Blender reads it",
+    ("reflfield/export/blender_scene/build_object.py", "direction_type"): "Blender reads it",
+    ("reflfield/export/blender_scene/build_object.py", "interpolation"): "Blender reads it",
+    ("reflfield/export/blender_scene/build_object.py", "operation"): "Blender reads it",
+    ("reflfield/export/blender_scene/build_object.py", "use_nodes"): "Blender reads it",
+    ("reflfield/export/blender_scene/build_object.py", "uv_map"): "Blender reads it",
+    ("reflfield/export/mitsuba_scene/reflfield_bsdf.py", "eta"): "Mitsuba reads it",
+    ("reflfield/export/mitsuba_scene/reflfield_bsdf.py", "m_components"): "Mitsuba reads it",
+    ("reflfield/export/mitsuba_scene/reflfield_bsdf.py", "m_flags"): "Mitsuba reads it",
+    (
+        "reflfield/export/mitsuba_scene/reflfield_bsdf.py",
+        "sampled_component",
+    ): "Mitsuba reads it",
+    ("reflfield/export/mitsuba_scene/reflfield_bsdf.py", "sampled_type"): "Mitsuba reads it",
+    ("reflfield/export/mitsuba_scene/reflfield_bsdf.py", "to_string"): "Mitsuba reads it",
     ("reflfield/viewer/page_server.py", "args"): "argument of a method of the library",
     ("reflfield/viewer/page_server.py", "daemon_threads"): "socketserver reads it",
     ("reflfield/viewer/page_server.py", "do_GET"): "http.server calls it",
@@ -48,8 +63,12 @@ PROMISED = {
     line.split("(")[0].partition(".")[2]
     for line in (ROOT / "tests/data/public_api.txt").read_text().splitlines()
 }
-# Modules that are started as processes, not imported.
-PROCESSES = {"reflfield.__main__", "capture_sim.__main__", "reflfield.geometry.xatlas_worker"}
+# Modules that are started as processes, or copied for other software, and not imported.
+PROCESSES = {
+    *("reflfield.__main__", "capture_sim.__main__", "reflfield.geometry.xatlas_worker"),
+    "reflfield.export.blender_scene.build_object",
+    *(f"reflfield.export.mitsuba_scene.{name}" for name in ("reflfield_bsdf", "render")),
+}
 
 
 def unmentioned(folder, paths):

@@ -23,11 +23,15 @@ if TYPE_CHECKING:
     import trimesh
 
     from reflfield.capture.cameras import Camera
+    from reflfield.geometry import textured_mesh
+    from reflfield.render import draped_field as draped
     from reflfield.render import renderer
     from reflfield.render.environment_map import EnvironmentMap
     from reflfield.render.renderer import Lighting, Renderer, RenderOptions
 else:  # opening and evaluating a field needs neither
     renderer, trimesh = LateImport("reflfield.render.renderer"), LateImport("trimesh")
+    textured_mesh = LateImport("reflfield.geometry.textured_mesh")
+    draped = LateImport("reflfield.render.draped_field")
 
 
 class Field:
@@ -188,6 +192,29 @@ class Field:
                 "lights=[PointLight(...)] or environment=EnvironmentMap.open(...)"
             )
         return sources
+
+    def on_mesh(self, mesh: Path | str, tiles: float = 1.0) -> Field:
+        """Return this flat field as the material of another mesh; see `render.draped_field`.
+
+        Parameters
+        ----------
+        mesh : Path or str
+            OBJ or GLB file with texture coordinates.
+        tiles : float
+            How often the field is repeated along each of them.
+
+        Returns
+        -------
+        Field
+            With the mesh as its surface, whose shadows are traced.
+
+        Raises
+        ------
+        InputError
+            If this field is not flat, its light is unknown, or the mesh cannot be used.
+        """
+        read = textured_mesh.read_textured_mesh(mesh)
+        return Field(draped.draped_field(self.stored, read, tiles))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return everything that a renderer of one's own needs, decoded.

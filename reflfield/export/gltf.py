@@ -1,11 +1,13 @@
-"""The base mesh with its texture as one binary glTF 2.0 file."""
+"""The base mesh with a material of textures as one binary glTF 2.0 file."""
 
 from __future__ import annotations
 
 import json
 import struct
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +27,63 @@ _VERTICES, _INDICES = 34962, 34963  # targets of buffer views: what a GPU binds 
 FAR_EXTENTS = 100.0
 
 
+@dataclass(frozen=True, eq=False)
+class GltfMaterial:
+    """A material as glTF describes it, with its textures.
+
+    Parameters
+    ----------
+    description : dict
+        The material; textures by their numbers in `textures`.
+    textures : tuple of (height, width, 3 or 4) uint8
+        Row 0 at v = 1; any size.
+    extras : dict
+        On the whole file, for `asset.extras`: plain JSON values.
+    """
+
+    description: dict[str, Any]
+    textures: tuple[NDArray[np.uint8], ...]
+    extras: dict[str, Any] = field(default_factory=dict)
+
+
+def colour_material(
+    base_colour: NDArray[np.uint8], name: str = "mean of all photographs", *, lit: bool = True
+) -> GltfMaterial:
+    """Rough dielectric of one texture of colours, or the colours as they are, not `lit`.
+
+    Parameters
+    ----------
+    base_colour : (height, width, 3) uint8
+        sRGB encoded, row 0 at v = 1; any size.
+    name : str
+    lit : bool
+        Whether viewers light it.
+
+    Raises
+    ------
+    InputError
+        If the texture is not an 8-bit RGB image.
+    """
+    check_shape("base_colour", base_colour, (None, None, 3))
+    if base_colour.dtype != np.uint8:
+        raise InputError(
+            f"base_colour: expected sRGB-encoded uint8, received {base_colour.dtype}; encode it"
+        )
+    surface = {
+        "baseColorTexture": {"index": 0},
+        "metallicFactor": 0.0,
+        "roughnessFactor": 0.8,
+    }
+    description: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface}
+    if not lit:
+        description["extensions"] = {"KHR_materials_unlit": {}}
+    return GltfMaterial(description, (base_colour,))
+
+
 def write_glb(
-    path: Path | str, atlas: Atlas, base_colour: NDArray[np.uint8], name: str = "reflfield"
+    path: Path | str, atlas: Atlas, material: GltfMaterial, name: str = "reflfield"
 ) -> None:
-    """Write mesh, normals, tangents, texture coordinates and base colour.
+    """Write mesh, normals, tangents, texture coordinates and a material.
 
     Opens in any glTF viewer. Texture coordinates are turned to glTF's convention
     (v downwards); tangents run along u, their fourth component is -1 in mirrored charts. Of a
@@ -40,25 +95,14 @@ def write_glb(
     path : Path or str
         Appears only when complete.
     atlas : Atlas
-    base_colour : (height, width, 3) uint8
-        sRGB encoded, row 0 at v = 1; any size.
+    material : GltfMaterial
     name : str
         Name of the node and mesh.
-
-    Raises
-    ------
-    InputError
-        If the texture is not an 8-bit RGB image.
 
     References
     ----------
     Khronos Group, "glTF 2.0 Specification", sections 3.7 and 4.
     """
-    check_shape("base_colour", base_colour, (None, None, 3))
-    if base_colour.dtype != np.uint8:
-        raise InputError(
-            f"base_colour: expected sRGB-encoded uint8, received {base_colour.dtype}; encode it"
-        )
     buffer = _Buffer()
     origin = far_origin(atlas.positions)
     attributes = {
@@ -68,12 +112,13 @@ def write_glb(
         "TEXCOORD_0": buffer.add((atlas.uv * [1.0, -1.0] + [0.0, 1.0]).astype("<f4"), "VEC2"),
     }
     indices = buffer.add(atlas.faces.astype("<u4").ravel(), "SCALAR", target=_INDICES)
-    image = buffer.add_bytes(_png(base_colour))
-    document = _document(name, attributes, indices, image, origin) | buffer.description()
+    images = [buffer.add_bytes(_png(texture)) for texture in material.textures]
+    document = _document(name, attributes, indices, images, origin)
+    _add_material(document, material)
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as partial:
-        partial.write_bytes(_glb(document, bytes(buffer.content)))
+        partial.write_bytes(_glb(document | buffer.description(), bytes(buffer.content)))
 
 
 def far_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -102,8 +147,9 @@ def vertex_tangents(atlas: Atlas) -> NDArray[np.float64]:
     for corner in range(3):
         np.add.at(total, atlas.faces[:, corner], weighted)
     tangents = frames(unit_or_zero(atlas.normals), total)[:, 0]
+    # By triangles, since a field's mesh is an atlas of one chart; vertices belong to one side.
     handedness = np.ones(len(tangents))
-    handedness[atlas.faces[atlas.mirrored[atlas.chart]]] = -1.0
+    handedness[atlas.faces[atlas.uv_areas < 0.0]] = -1.0
     return np.column_stack([tangents, handedness])
 
 
@@ -157,18 +203,10 @@ def _document(
     name: str,
     attributes: dict[str, int],
     indices: int,
-    image: int,
+    images: list[int],
     origin: NDArray[np.float64],
-) -> dict[str, object]:
-    """Scene with one mesh and one rough dielectric material."""
-    material = {
-        "name": "mean of all photographs",
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicFactor": 0.0,
-            "roughnessFactor": 0.8,
-        },
-    }
+) -> dict[str, Any]:
+    """Scene with one mesh, and textures for its material."""
     node: dict[str, object] = {"name": name, "mesh": 0}
     if origin.any():
         node["translation"] = origin.tolist()
@@ -179,13 +217,20 @@ def _document(
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
         "meshes": [{"name": name, "primitives": [primitive]}],
-        "materials": [material],
-        "textures": [{"source": 0, "sampler": 0}],
+        "textures": [{"source": number, "sampler": 0} for number in range(len(images))],
         "samplers": [
             {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
         ],  # linear, trilinear, clamped
-        "images": [{"bufferView": image, "mimeType": "image/png"}],
+        "images": [{"bufferView": image, "mimeType": "image/png"} for image in images],
     }
+
+
+def _add_material(document: dict[str, Any], material: GltfMaterial) -> None:
+    document["materials"] = [material.description]
+    if extensions := sorted(material.description.get("extensions", {})):
+        document["extensionsUsed"] = extensions
+    if material.extras:
+        document["asset"]["extras"] = material.extras
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:

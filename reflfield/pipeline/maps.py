@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_writing import write_exr
-from reflfield.export.gltf import write_glb
+from reflfield.export.gltf import colour_material, write_glb
 from reflfield.field.file import open_field
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.held_out_photographs import mean_sample
@@ -77,6 +77,5 @@ def _write_mesh(context: Context, average: NDArray[np.float32], folder: Path) ->
     texels = results.texels(context).texel_of_pixel
     image = encode_srgb(np.clip(known / white, 0, 1))[np.maximum(texels, 0)]
     image = np.where(texels[..., None] >= 0, image, 0)
-    write_glb(
-        folder / "atlas.glb", results.atlas(context), np.rint(image * 255).astype(np.uint8)
-    )
+    material = colour_material(np.rint(image * 255).astype(np.uint8))
+    write_glb(folder / "atlas.glb", results.atlas(context), material)

@@ -230,6 +230,16 @@ class FieldSurface:
         """Positions and triangle normals of all texels, (n_texels, 3) each."""
         return self.texels.position, self.texels.face_normal.astype(np.float64)
 
+    @cached_property
+    def local_from_texture(self) -> Array:
+        """Frames of texels from the axes of the texture there, (n_texels, 3, 3) float64.
+
+        Those axes are the direction of u, the one across it, and the normal of the surface.
+        """
+        world_from_texture = np.swapaxes(self.texels.local_from_world.astype(np.float64), 1, 2)
+        local: Array = self.field.local_from_world.astype(np.float64)
+        return local @ world_from_texture
+
 
 def field_atlas(field: ReflectanceField, vertex_normals: Array) -> Atlas:
     """Base mesh of a field with its texture coordinates, as one chart.

@@ -193,16 +193,43 @@ class Renderer:
         InputError
             If a light is unknown but the field's lights were known.
         """
-        sources = self._sources(lights)
-        image = np.zeros((camera.height, camera.width, 3), np.float32)
+        images, coverage = self._images(camera, [self._sources(lights)])
+        return Rendering(images[0], coverage)
+
+    def render_each(self, camera: Camera, lights: Sequence[Light]) -> list[Rendering]:
+        """Make one image for each light; rays are traced once for all.
+
+        Parameters
+        ----------
+        camera : Camera
+        lights : sequence of Light
+
+        Returns
+        -------
+        list of Rendering
+            They share their coverage.
+
+        Raises
+        ------
+        InputError
+            If a light is unknown but the field's lights were known.
+        """
+        images, coverage = self._images(camera, [self._sources(light) for light in lights])
+        return [Rendering(image, coverage) for image in images]
+
+    def _images(
+        self, camera: Camera, groups: Sequence[Sequence[Light | EnvironmentLighting]]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Image under each group of lights, and their coverage."""
+        images = np.zeros((len(groups), camera.height, camera.width, 3), np.float32)
         coverage = np.zeros((camera.height, camera.width), np.float32)
         blocks = _blocks(pixel_window(camera, self.surface.mesh), self.options.block_pixels)
         with ThreadPoolExecutor(self.options.n_threads) as pool:
-            done = pool.map(lambda block: self._block(camera, sources, *block), blocks)
+            done = pool.map(lambda block: self._block(camera, groups, *block), blocks)
             for (row, column), (radiance, covered) in zip(blocks, done, strict=True):
-                image[row, column] = radiance
+                images[:, row, column] = radiance
                 coverage[row, column] = covered
-        return Rendering(image, coverage)
+        return images, coverage
 
     def _sources(self, lights: Lighting) -> list[Light | EnvironmentLighting]:
         all_lights = [lights] if isinstance(lights, Light | EnvironmentMap) else list(lights)
@@ -240,11 +267,11 @@ class Renderer:
     def _block(
         self,
         camera: Camera,
-        sources: Sequence[Light | EnvironmentLighting],
+        groups: Sequence[Sequence[Light | EnvironmentLighting]],
         row: NDArray[np.int64],
         column: NDArray[np.int64],
     ) -> tuple[Array, Array]:
-        """Radiance (n, 3) and coverage (n,) of some pixels."""
+        """Radiance (n_groups, n, 3) and coverage (n,) of some pixels."""
         offsets = subpixel_offsets(self.options.samples_per_pixel)
         pixels = np.stack([column, row], axis=1)[:, None, :] + offsets
         rays = self.surface.camera_rays(camera, pixels.reshape(-1, 2))
@@ -253,11 +280,13 @@ class Renderer:
         covered = np.bincount(pixel, minlength=len(row)) / len(offsets)
         transition = self.surface.transitions(camera, hits)
         entries = self.surface.footprints(hits, pixel, transition)
-        total = np.zeros((len(row), 3))
-        for source in sources:
+        total = np.zeros((len(groups), len(row), 3))
+        for image, source in (
+            (i, source) for i, group in enumerate(groups) for source in group
+        ):
             radiance = self._radiance(camera, source, hits, entries)
             for channel in range(3):
-                total[:, channel] += np.bincount(
+                total[image, :, channel] += np.bincount(
                     entries.pixel, radiance[:, channel], minlength=len(row)
                 )
         return total / len(offsets), covered

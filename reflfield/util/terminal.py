@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import typer
 from rich.console import Console
@@ -78,3 +79,11 @@ def say(line: str) -> None:
     except OSError as error:
         error.filename = "standard output"
         raise
+
+
+def system_words(error: OSError) -> str:
+    """What the system says, and of which file; where it names none, of the working folder."""
+    named = str(error.filename or Path.cwd())
+    if error.filename2:
+        named = f"{named}, {error.filename2}"
+    return f"{named}: {error.strerror or error}"

@@ -9,7 +9,7 @@ import trimesh
 from PIL import Image
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.export.gltf import vertex_tangents, write_glb
+from reflfield.export.gltf import colour_material, vertex_tangents, write_glb
 from reflfield.geometry.uv_atlas import Atlas
 
 # Asymmetric: red top left, green top right, blue bottom left, white bottom right.
@@ -58,7 +58,8 @@ def test_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
     """Coordinates of a survey: single precision there has steps of half a metre."""
     path, far = tmp_path / "atlas.glb", np.array([441547.5, 5121946.5, 2345.0])
     near = quad()
-    write_glb(path, replace(near, positions=near.positions * 0.1 + far), TEXTURE)
+    moved = replace(near, positions=near.positions * 0.1 + far)
+    write_glb(path, moved, colour_material(TEXTURE))
     document, _ = chunks(path)
     relative = accessor(path, "POSITION")
     # To the rounding of a float of the size of the quad.
@@ -70,7 +71,7 @@ def test_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
 
 def test_trimesh_reads_geometry_and_the_texture_the_right_way_up(tmp_path):
     path = tmp_path / "deep" / "atlas.glb"
-    write_glb(path, quad(), TEXTURE)
+    write_glb(path, quad(), colour_material(TEXTURE))
     (loaded,) = trimesh.load_scene(path).geometry.values()
     np.testing.assert_array_equal(loaded.vertices, quad().positions)
     np.testing.assert_array_equal(loaded.faces, quad().faces)
@@ -84,7 +85,7 @@ def test_trimesh_reads_geometry_and_the_texture_the_right_way_up(tmp_path):
 
 
 def test_the_file_holds_what_the_specification_asks_for(tmp_path):
-    write_glb(tmp_path / "a.glb", quad(), TEXTURE)
+    write_glb(tmp_path / "a.glb", quad(), colour_material(TEXTURE))
     document, binary = chunks(tmp_path / "a.glb")
     assert document["buffers"][0]["byteLength"] == len(binary)
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
@@ -99,7 +100,7 @@ def test_the_file_holds_what_the_specification_asks_for(tmp_path):
 
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_the_bitangent_runs_up_the_texture(tmp_path, mirrored):
-    write_glb(tmp_path / "a.glb", quad(mirrored), TEXTURE)
+    write_glb(tmp_path / "a.glb", quad(mirrored), colour_material(TEXTURE))
     tangent = accessor(tmp_path / "a.glb", "TANGENT")
     np.testing.assert_array_equal(tangent, vertex_tangents(quad(mirrored)).astype("f4"))
     way = -1.0 if mirrored else 1.0
@@ -108,9 +109,8 @@ def test_the_bitangent_runs_up_the_texture(tmp_path, mirrored):
     np.testing.assert_allclose(bitangent, [[0, 1, 0]] * 4, atol=1e-7)
 
 
-def test_textures_that_are_not_encoded_are_refused(tmp_path):
+def test_textures_that_are_not_encoded_are_refused():
     with pytest.raises(InputError, match="uint8"):
-        write_glb(tmp_path / "a.glb", quad(), TEXTURE.astype(np.float32))
+        colour_material(TEXTURE.astype(np.float32))
     with pytest.raises(ShapeError, match="base_colour"):
-        write_glb(tmp_path / "a.glb", quad(), TEXTURE[..., 0])
-    assert not list(tmp_path.iterdir())
+        colour_material(TEXTURE[..., 0])

@@ -27,6 +27,7 @@ from reflfield.report.sections.held_out_images import (
     alignment_section,
     comparisons_table,
     held_out_section,
+    measured_lines,
     metrics_table,
 )
 from reflfield.report.sections.run_summary import (
@@ -64,6 +65,7 @@ __all__ = [
     "coverage_section",
     "held_out_section",
     "key_numbers",
+    "measured_lines",
     "metrics_table",
     "normals_section",
     "rate_distortion_section",

@@ -292,3 +292,20 @@ def comparisons_table(comparisons: Mapping[str, Comparison]) -> Table:
         tuple((name, *metric_cells(c.mean)) for name, c in comparisons.items()),
         "Mean over the photographs: higher PSNR and SSIM and lower FLIP are better.",
     )
+
+
+def measured_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Mean metrics in one line, and on what they were measured in another."""
+    mean, n = metrics["mean"], len(metrics["frames"])
+    measured = metrics["measured"]
+    parts = [f"measured on {measured['pixels']} pixels"]
+    if left_out := measured["saturated_pixels_left_out"]:
+        parts.append(f"{left_out} saturated ones left out")
+    if names := measured["frames_not_measured"]:
+        parts.append(f"without a pixel of the object: {', '.join(names)}")
+    origins = ", ".join(f"{name} {n}" for name, n in measured["silhouettes"].items())
+    return [
+        f"{n} frame{'' if n == 1 else 's'}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
+        f"{mean['psnr_hdr']:.2f} dB (HDR), SSIM {mean['ssim']:.4f}, FLIP {mean['flip']:.4f}",
+        "; ".join([*parts, f"silhouettes: {origins}"]),
+    ]

@@ -1,0 +1,51 @@
+"""Fields as BTF containers, read back."""
+
+import numpy as np
+import pytest
+
+from reflfield.capture.btf_container import directions_of, read_btf
+from reflfield.errors import InputError
+from reflfield.export import btf
+from reflfield.export.formats import export_field
+from reflfield.field.evaluation import evaluate
+from tests.synthetic_fields import baked_field, lambert, square_surface
+from tests.viewer.shown_fields import half_vector_field
+
+
+def test_the_container_shows_the_samples_of_the_field(tmp_path, monkeypatch):
+    """Of sums of tables to the rounding of singles; frames from the world by hand."""
+    field = half_vector_field()
+    monkeypatch.setattr(btf, "_SOME_TEXELS", 48)
+    (line,) = export_field(field, tmp_path / "a.btf", "btf")
+    read = read_btf(tmp_path / "a.btf")
+    height, width = field.texel_of_pixel.shape
+    assert (read.width, read.height, len(read.views)) == (width, height, 151)
+    # Three diffuse channels; the weights of the two lobes vary as two of them do.
+    assert line.startswith("3 components")
+    column, view, light = 5 * width + 3, 60, 130
+    texel = field.texel_of_pixel.ravel()[column]
+    world = [directions_of(a)[i] @ field.local_from_world[texel]
+             for a, i in ((read.views, view), (read.lights, light))]  # fmt: skip
+    wanted = evaluate(field, [texel], *(np.asarray(d, "f4")[None] for d in world))[0]
+    shown = read.entries(np.array([column]))[0, view, light]
+    np.testing.assert_allclose(shown, wanted, rtol=1e-3, atol=1e-4)
+    assert read.cosine_included
+
+
+def test_rotations_are_those_of_the_flat_sample(tmp_path):
+    surface = square_surface(3)
+    c, s = np.cos(0.3), np.sin(0.3)
+    turn = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    surface.base_from_world[:] = turn
+    field = baked_field(surface, lambert(0.5))
+    export_field(field, tmp_path / "a.btf", "btf")
+    # Frames are stored in steps of a hundredth of a degree.
+    np.testing.assert_allclose(
+        read_btf(tmp_path / "a.btf").rotations, np.tile(turn, (9, 1, 1)), atol=4e-4
+    )
+
+
+def test_an_unknown_light_is_refused(tmp_path):
+    field = baked_field(square_surface(2), lambert(0.5), light_side=1, light_model="unknown")
+    with pytest.raises(InputError, match="unknown light"):
+        export_field(field, tmp_path / "a.btf", "btf")

@@ -1,0 +1,122 @@
+"""Blender's script and the MaterialX text, by the tools themselves where they are."""
+
+import importlib.util
+import json
+import types
+from unittest import mock
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reflfield.export.formats import export_field
+from reflfield.export.map_images import openpbr_images, principled_images, stretch_turns, widths
+from reflfield.export.material_maps import MaterialMaps
+from tests.viewer.shown_fields import half_vector_field
+
+
+def maps_of(roughness, strength, direction):
+    """One texel."""
+
+    def texel(*values):
+        return np.rint(255 * np.array([[values]])).astype(np.uint8)
+
+    return MaterialMaps(
+        texel(0.5, 0.5, 0.5), texel(1.0, roughness, 0.0), texel(0.5, 0.5, 1.0),
+        texel(0.5 + 0.5 * direction[0], 0.5 + 0.5 * direction[1], strength),
+        texel(1.0, 1.0, 1.0, 1.0), 1.0, 1.0, 1.0, {},
+    )  # fmt: skip
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize(("roughness", "strength"), [(0.5, 0.0), (0.4, 0.35), (0.6, 0.5)])
+def test_widths_are_kept_by_the_formulas_of_both(roughness, strength):
+    """Blender's manual: alpha / aspect, alpha aspect; OpenPBR's specification."""
+    maps = maps_of(roughness, strength, (1.0, 0.0))
+    along, across = (one[0, 0] for one in widths(maps))
+    images = {name: image[0, 0] / 255 for name, image in principled_images(maps).items()}
+    aspect = np.sqrt(1 - 0.9 * images["anisotropic"])
+    alpha = images["roughness"] ** 2
+    # Steps of 255ths of both: 2 % of a width of .15, the smallest here.
+    np.testing.assert_allclose([alpha / aspect, alpha * aspect], [along, across], rtol=0.02)
+    images = {name: image[0, 0] / 255 for name, image in openpbr_images(maps).items()}
+    a, r2 = images["anisotropy"], images["roughness"] ** 2
+    t = r2 * np.sqrt(2 / (1 + (1 - a) ** 2))
+    np.testing.assert_allclose([t, (1 - a) * t], [along, across], rtol=0.02)
+
+
+def test_directions_are_turns_from_the_tangent():
+    for angle in (0.0, 0.3, 1.2, 2.9):
+        maps = maps_of(0.5, 0.3, (np.cos(angle), np.sin(angle)))
+        turns = stretch_turns(maps)[0, 0]
+        off = np.mod(turns - angle / (2 * np.pi) + 0.25, 0.5) - 0.25
+        assert abs(off) < 0.002  # of 8-bit components
+
+
+def load(path):
+    spec = importlib.util.spec_from_file_location("build_object", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    root, field = tmp_path_factory.mktemp("maps"), half_vector_field()
+    for name in ("blender", "materialx"):
+        export_field(field, root / name, name)
+    return field, root
+
+
+def test_the_script_links_every_map(folders, monkeypatch):
+    """With a stand-in for Blender that takes every call and keeps the links."""
+    field, root = folders
+    bpy = mock.MagicMock()
+    bsdf = types.SimpleNamespace(type="BSDF_PRINCIPLED", inputs=mock.MagicMock())
+    tree = bpy.data.materials.new.return_value.node_tree
+    tree.nodes.__iter__.return_value = iter([bsdf])
+    monkeypatch.setitem(__import__("sys").modules, "bpy", bpy)
+    load(root / "blender" / "build_object.py").build()
+    read = {call.args[0].rsplit("/", 1)[-1] for call in bpy.data.images.load.call_args_list}
+    assert read == {path.name for path in (root / "blender").glob("*.png")}
+    vertices, _, faces = bpy.data.meshes.new.return_value.from_pydata.call_args.args
+    assert (len(vertices), len(faces)) == (len(field.positions), len(field.faces))
+    sockets = {call.args[0] for call in bsdf.inputs.__getitem__.call_args_list}
+    assert {"Base Color", "Normal", "Tangent", "Anisotropic Rotation"} <= sockets
+
+
+@pytest.mark.reference
+def test_blender_builds_the_object(folders):
+    bpy = pytest.importorskip("bpy", reason="needs Blender's module bpy")
+    field, root = folders
+    made = load(root / "blender" / "build_object.py").build()
+    assert len(made.data.polygons) == len(field.faces)
+    tree = made.data.materials[0].node_tree
+    linked = {
+        link.to_socket.name for link in tree.links if link.to_node.type == "BSDF_PRINCIPLED"
+    }
+    assert len(linked) == 9
+    assert made.name in bpy.data.objects
+
+
+@pytest.mark.reference
+def test_materialx_validates_the_text(folders):
+    mx = pytest.importorskip("MaterialX", reason="needs the package MaterialX")
+    document, library = mx.createDocument(), mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    mx.readFromXmlFile(document, str(folders[1] / "materialx" / "material.mtlx"))
+    document.setDataLibrary(library)
+    valid, message = document.validate()
+    assert valid, message
+    (material,) = document.getMaterialNodes()
+    assert mx.getShaderNodes(material)[0].getCategory() == "open_pbr_surface"
+    assert mx.getShaderNodes(material)[0].getNodeDef() is not None
+
+
+def test_images_have_the_size_of_the_texture(folders):
+    field, root = folders
+    for path in root.rglob("*.png"):
+        with Image.open(path) as image:
+            assert image.size == field.texel_of_pixel.shape[::-1]
+    about = json.loads((root / "blender" / "material.json").read_text())
+    assert 0 < about["error"]["relative"] < 0.3
