@@ -58,6 +58,11 @@ Array = NDArray[np.float64]
 
 # Photographs that are looked at for the axes of all lights.
 MOST_LOOKS = 64
+# Kinds of finding on photographs that do not show what they should.
+OUT_OF_PLACE = (
+    *("swapped photographs", "photograph of another light", "odd photograph"),
+    *("turned photograph", "exposure of a photograph"),
+)
 
 
 def check_capture(capture: Capture) -> Findings:
@@ -98,7 +103,7 @@ def check_capture(capture: Capture) -> Findings:
         of_views, shape = _of_views(capture, photographs, views)
         findings += of_views
         findings += _of_surface(capture, photographs, shape, fits)
-    told = {name for finding in findings for name in finding.subjects}
+    told = {name for one in findings if one.kind in OUT_OF_PLACE for name in one.subjects}
     findings += repeated_findings(capture, photographs, told if fits else None)
     return Findings.sorted(findings, measures(capture))
 

@@ -25,6 +25,8 @@ MOST_OFF = 0.25
 GRAVE = np.log(2.0)
 # How much better another place fits, at least, and how much worse than usual the own one.
 LEAST_REGRET, LEAST_LOSS, LOSS_DEVIATIONS = 0.04, 0.04, 5.0
+# The same of two lights of which each fits better to the other's place.
+MUTUAL_REGRET = 0.1
 # Lights whose place is near that of another one are told apart by little.
 LEAST_ANGLE = np.radians(8.0)
 
@@ -53,11 +55,18 @@ def misplaced_lights(fit: LightFit, directions: Array) -> list[Misplaced]:
     regret = np.array([other for _, other in others]) - own
     usual, scatter = robust_spread(own)
     lowest = usual - max(LEAST_LOSS, LOSS_DEVIATIONS * scatter)
+    mutual = {
+        light
+        for light, (better, _) in enumerate(others)
+        if others[better][0] == light
+        and min(regret[light], regret[better]) > MUTUAL_REGRET
+        and max(own[light], own[better]) < usual - LEAST_LOSS
+    }
     return [
         Misplaced(light, better, float(own[light]), other)
         for light, (better, other) in enumerate(others)
         if regret[light] > LEAST_REGRET
-        and own[light] < lowest
+        and (own[light] < lowest or light in mutual)
         and directions[light] @ directions[better] < np.cos(LEAST_ANGLE)
     ]
 

@@ -196,7 +196,7 @@ def colour_findings(capture: Capture, photographs: PhotographSet) -> Iterator[Fi
         worst = indices[int(odd[np.argmax(change[odd])])]
         yield Finding(
             "colour of photographs",
-            WARNING,
+            NOTE,
             tuple(capture.photographs[indices[int(row)]].name for row in odd),
             f"their colour differs from that of others of their view and light by up to "
             f"{100 * (np.exp(change[odd].max()) - 1):.0f} %",
