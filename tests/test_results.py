@@ -25,6 +25,7 @@ WRITTEN = {
     *("capture.json", "transforms.json", "transforms_train.json", "transforms_test.json"),
     *("transforms_val.json", "header.json", "metrics.json", "timings.json", "options.toml"),
     *("OUT/timings.json", "OUT/options.toml", "report/index.html"),
+    *("reflfield_bsdf.py", "render.py", "info.json", "build_object.py"),
     *("DIR/check.json", "DIR/index.html", "check.json"),
     *("truth/effects.json", "truth/rig.json", "results/NAME.json"),
 }

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from reflfield.errors import InputError
 from reflfield.export.blender import write_blender
-from reflfield.export.btf import write_btf_field
+from reflfield.export.btf_samples import write_btf_field
 from reflfield.export.gltf import colour_material, write_glb
 from reflfield.export.material_maps import export_atlas, gltf_material, material_maps
 from reflfield.export.materialx import write_materialx

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from reflfield.capture.btf_container import directions_of, read_btf
+from reflfield.capture.btf import read_btf
 from reflfield.errors import InputError
-from reflfield.export import btf
+from reflfield.export import btf_samples
 from reflfield.export.formats import export_field
 from reflfield.field.evaluation import evaluate
 from tests.synthetic_fields import baked_field, lambert, square_surface
@@ -15,19 +15,20 @@ from tests.viewer.shown_fields import half_vector_field
 def test_the_container_shows_the_samples_of_the_field(tmp_path, monkeypatch):
     """Of sums of tables to the rounding of singles; frames from the world by hand."""
     field = half_vector_field()
-    monkeypatch.setattr(btf, "_SOME_TEXELS", 48)
+    monkeypatch.setattr(btf_samples, "_SOME_TEXELS", 48)
     (line,) = export_field(field, tmp_path / "a.btf", "btf")
     read = read_btf(tmp_path / "a.btf")
     height, width = field.texel_of_pixel.shape
     assert (read.width, read.height, len(read.views)) == (width, height, 151)
-    # Three diffuse channels; the weights of the two lobes vary as two of them do.
-    assert line.startswith("3 components")
+    # Three diffuse channels, and weights of two lobes whose channels are skewed apart.
+    assert line.startswith(("8 components", "3 components"))
     column, view, light = 5 * width + 3, 60, 130
     texel = field.texel_of_pixel.ravel()[column]
-    world = [directions_of(a)[i] @ field.local_from_world[texel]
-             for a, i in ((read.views, view), (read.lights, light))]  # fmt: skip
+    world = [d @ field.local_from_world[texel] for d in (read.views[view], read.lights[light])]
     wanted = evaluate(field, [texel], *(np.asarray(d, "f4")[None] for d in world))[0]
-    shown = read.entries(np.array([column]))[0, view, light]
+    u, v = read.factors[0]
+    first = 3 * (light + len(read.lights) * view)
+    shown = u[first : first + 3] @ v[column]
     np.testing.assert_allclose(shown, wanted, rtol=1e-3, atol=1e-4)
     assert read.cosine_included
 

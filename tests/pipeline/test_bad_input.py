@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,7 +141,11 @@ class TestDescription:
     ):
         described(capture_copy, lambda d: d["lights"][1].update(position=[0.01, 0, 0]))
         outcome = run_tiny(tmp_path / "out", "--hold-out", "", capture=capture_copy)
-        refused(outcome, "l001", "inside")
+        # What is cheap to check comes first, and finds that the light shows nothing.
+        note, _, error = outcome.err.partition("\n")
+        assert "note" in note
+        assert "dead light l001" in note
+        refused(replace(outcome, err=error), "l001", "inside")
         assert not (tmp_path / "out" / "stages" / "hull").exists()
 
 

@@ -16,7 +16,8 @@ For view v and light l in the frame of a texel, h their half vector, the value i
               + V * sum_k weight_k * T_k(h, d) * (1 + K_k(r, d) cos 2a))
 
 with tables B, T and K, multilinear, d the angle between h and l, r that between h and the
-normal, a the azimuth between the two planes of these angles, s the cosine rounded at the horizon, and V = 1 / (l_z + v_z - l_z v_z). The four texels around a point are blended.
+normal, a the azimuth between the two planes of these angles, s the cosine rounded at the
+horizon, and V = 1 / (l_z + v_z - l_z v_z). The four texels around a point are blended.
 Directions are sampled by the cosine, or by half vectors from the tables, as the nearest texel
 says.
 """

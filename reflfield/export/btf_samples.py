@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.btf_container import (
+from reflfield.capture.btf import Btf, read_btf
+from reflfield.errors import InputError
+from reflfield.export.btf_container import (
     BtfContainer,
     angles_of,
     directions_of,
-    read_btf,
     write_btf,
 )
-from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.render.camera_rays import FieldSurface
@@ -156,7 +156,7 @@ def _rows(pairs: NDArray[np.integer]) -> NDArray[np.integer]:
 def _error(
     field: ReflectanceField,
     directions: Doubles,
-    container: BtfContainer,
+    container: Btf,
     rng: np.random.Generator,
 ) -> float:
     """Relative difference of the container from the field at other pairs and texels."""
@@ -164,6 +164,7 @@ def _error(
     places = np.flatnonzero(field.texel_of_pixel.ravel() >= 0)
     places = rng.choice(places, min(_SOME_TEXELS, len(places)), replace=False)
     wanted = _samples(field, field.texel_of_pixel.ravel()[places], directions, pairs)
-    shown = container.sv[places] @ container.u[_rows(pairs)].T
+    ((u, v),) = container.factors
+    shown = v[places] @ np.asarray(u)[_rows(pairs)].T
     off, size = np.linalg.norm(shown - wanted), np.linalg.norm(wanted)
     return float(off / max(float(size), 1e-300))
