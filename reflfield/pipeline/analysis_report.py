@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from reflfield.capture.image_files import read_image
 from reflfield.metrics.baselines import BASELINES as BASELINE_NAMES
@@ -22,6 +26,22 @@ from reflfield.report.sections import AnalysedImage, AnalysedImages
 from reflfield.util.files import load_arrays
 
 HEADER_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class ImageFiles(Mapping[str, NDArray[np.float32]]):
+    """Images by name, each read when it is asked for, and not kept."""
+
+    files: Mapping[str, Path]
+
+    def __getitem__(self, name: str) -> NDArray[np.float32]:
+        return read_image(self.files[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
 
 
 def analysed_images(
@@ -59,16 +79,14 @@ def _shown(names: list[str], pairs: RelitPairs, folder: Path) -> Iterator[Analys
     places = {p.name: i for i, p in enumerate(pairs.frames.photographs)}
     for name in names:
         pair = pairs.read(places[name])
-        files = {each: image_file(folder, name, each) for each in BASELINE_NAMES}
+        files = {
+            each: image_file(folder, name, each) for each in BASELINE_NAMES if each != BLACK
+        }
         stored = load_arrays(
             folder / f"{name}.{KIND_FILE}", pair.silhouette.size + HEADER_BYTES
         )
         yield AnalysedImage(
             pair,
-            {
-                each: read_image(path)
-                for each, path in files.items()
-                if each != BLACK and path.is_file()
-            },
+            ImageFiles({each: path for each, path in files.items() if path.is_file()}),
             stored["kinds"],
         )
