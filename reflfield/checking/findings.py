@@ -126,7 +126,7 @@ def robust_spread(values: Sequence[float] | NDArray[np.floating[Any]]) -> tuple[
     --------
     >>> median, deviation = robust_spread([1.0, 2.0, 2.0, 3.0, 4.0, 5.0, 100.0])
     >>> median, round(deviation, 4)
-    (3.0, 1.5604)
+    (3.0, 1.5605)
     """
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known)]
