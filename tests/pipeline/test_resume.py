@@ -65,7 +65,7 @@ def test_killed_at_random_moments_and_run_again(
     left: dict[str, set] = {}
     for _ in range(n_kills):
         before = set(records(out)) if out.exists() else set()
-        killed = subprocess_run("-c", KILLED_AT, int(rng.integers(5, 30)), *words, *held)
+        killed = subprocess_run("-c", KILLED_AT, int(rng.integers(14, 39)), *words, *held)
         assert killed.status == -signal.SIGKILL, killed.err
         assert not (out / "field.rfld").exists()
         for partial in out.glob("stages/*.partial"):
