@@ -51,8 +51,14 @@ BACKDROP_SHARE = 0.95
 # Differences from the backdrop, over its variation, of what is certainly object and of what
 # belongs to it if it is near.
 STRONG, WEAK = 3.5, 1.75
-# Parts and holes with a smaller share of the object's area are removed and filled.
-SMALLEST_PART = 0.005
+# The surface counts where it strays from the border's colour by so much, and by this share of
+# what the backdrop strays from the surface: cloth that is dark all over is taken for even.
+LEAST_UNEVEN, UNEVEN_SHARE = 0.02, 0.7
+# The same thresholds over the variation of an even backdrop, by the difference from one colour.
+STRONG_EVEN, WEAK_EVEN = 3.0, 1.25
+# Parts and holes with a smaller share of the object's area are removed and filled; what is lit
+# unevenly may be seen in pieces.
+SMALLEST_PART, SMALLEST_PIECE = 0.05, 0.005
 SMALLEST_HOLE = 0.015
 # Width of the band beside the outline in which coverage may lie between 0 and 1.
 SOFT_EDGE = 0.003
@@ -101,11 +107,12 @@ def silhouette_from_photographs(
     backdrop = np.median(encoded[border], axis=0)
     difference = np.abs(encoded - backdrop).max(axis=2)
     uniform = np.quantile(difference[border], 0.75) < UNIFORM_SPREAD
+    smallest = SMALLEST_PART
     if uniform:
-        inside = _differs_from_backdrop(encoded, difference)
+        inside, smallest = _differs_from_backdrop(encoded, difference, border)
     else:
         inside = _grabcut(encoded, border)
-    seen, inside = inside, _cleaned(inside)
+    seen, inside = inside, _cleaned(inside, smallest)
     share = float(inside.mean())
     if not 0.0005 < share < 0.995:
         raise CaptureError(
@@ -115,7 +122,8 @@ def silhouette_from_photographs(
     if not uniform:
         return _smoothed(inside)
     linear_backdrop = np.median(image[border], axis=0)
-    return _soft_edged(np.abs(image - linear_backdrop).max(axis=2), seen, inside)
+    away = np.abs(image - linear_backdrop).max(axis=2)
+    return _soft_edged(away, seen, inside, smallest)
 
 
 def _mean(photographs: Iterable[Float32], name: str) -> Float32:
@@ -149,12 +157,14 @@ def _border(height: int, width: int, fraction: float) -> Bool:
     return border
 
 
-def _differs_from_backdrop(encoded: Float32, difference: Float32) -> Bool:
-    """Pixels that differ from the backdrop, or differ a little and are near such ones.
+def _differs_from_backdrop(
+    encoded: Float32, difference: Float32, border: Bool
+) -> tuple[Bool, float]:
+    """Pixels that differ from the backdrop, and the smallest part that counts.
 
-    Both thresholds follow what the backdrop itself varies by; the upper one is at most
-    Otsu's, which splits the two levels of the difference from the border's colour. What touches
-    the border of the image must be brighter than that somewhere: the backdrop goes on there.
+    Pixels that differ a little belong to it, if they are near others. Both thresholds follow
+    what the backdrop itself varies by; the upper one is at most Otsu's, which splits the two
+    levels of the difference from the border's colour.
     """
     height, width = difference.shape
     n = max(3, round(MARGIN * max(height, width)))
@@ -162,16 +172,38 @@ def _differs_from_backdrop(encoded: Float32, difference: Float32) -> Bool:
     otsu = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0] / 255
     bright = difference > max(otsu, LEAST_CONTRAST)
     far = cv2.dilate(bright.astype(np.uint8), _disc(n)) == 0
-    backdrop = _backdrop(encoded, far)
-    smooth = cv2.GaussianBlur(np.abs(encoded - backdrop).max(axis=2), (0, 0), 0.7)
-    border = _border(height, width, BORDER)
-    variation = min(_variation(smooth[border]), _variation(smooth[far]))
-    strong = float(np.clip(STRONG * variation, 2 * LEAST_CONTRAST, max(otsu, 0.1)))
-    weak = float(np.clip(WEAK * variation, LEAST_CONTRAST, 0.75 * strong))
-    near = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
-    inside = _touching((smooth > weak) & near, smooth > strong)
+    surface = _backdrop(encoded, far)
+    if not _is_uneven(encoded, surface, border, far):
+        in_border = 2.5 * float(np.quantile(difference[border], 0.95)) + 1 / 255
+        of_far = float(np.quantile(difference[far], 0.99)) if far.any() else 0.0
+        ends = (STRONG_EVEN, WEAK_EVEN, min(in_border, of_far), otsu)
+        return _connected(cv2.GaussianBlur(difference, (0, 0), 0.7), ends, n), SMALLEST_PART
+    smooth = cv2.GaussianBlur(np.abs(encoded - surface).max(axis=2), (0, 0), 0.7)
+    beside = _border(height, width, BORDER)
+    variation = min(_variation(smooth[beside]), _variation(smooth[far]))
+    inside = _connected(smooth, (STRONG, WEAK, variation, otsu), n)
+    # What touches the border must be bright somewhere: the backdrop goes on there.
     at_border = _touching(inside, _border(height, width, 0.0))
-    return (inside & ~at_border) | _touching(inside, bright)
+    return (inside & ~at_border) | _touching(inside, bright), SMALLEST_PIECE
+
+
+def _connected(smooth: Float32, ends: tuple[float, float, float, float], n: int) -> Bool:
+    """Pixels above the upper threshold, and those above the lower one that are beside them."""
+    strong_share, weak_share, variation, otsu = ends
+    strong = float(np.clip(strong_share * variation, 2 * LEAST_CONTRAST, max(otsu, 0.1)))
+    weak = float(np.clip(weak_share * variation, LEAST_CONTRAST, 0.75 * strong))
+    near = cv2.dilate((smooth > strong).astype(np.uint8), _disc(n)) > 0
+    return _touching((smooth > weak) & near, smooth > strong)
+
+
+def _is_uneven(encoded: Float32, surface: Float32, border: Bool, far: Bool) -> bool:
+    """Whether a backdrop is lit unevenly: by more than it varies by anyway."""
+    if not far.any():
+        return False
+    colour = np.median(encoded[border], axis=0)
+    bend = float(np.quantile(np.abs(surface - colour).max(axis=2)[far], BACKDROP_SHARE))
+    noise = float(np.quantile(np.abs(encoded - surface).max(axis=2)[far], BACKDROP_SHARE))
+    return bend > max(LEAST_UNEVEN, UNEVEN_SHARE * noise)
 
 
 def _variation(difference: Float32) -> float:
@@ -249,11 +281,11 @@ def _grabcut(encoded: Float32, border: Bool) -> Bool:
     return cv2.resize(inside, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
 
 
-def _cleaned(inside: Bool) -> Bool:
+def _cleaned(inside: Bool, smallest: float) -> Bool:
     """Close gaps, remove small components, fill small holes; large holes keep their shape."""
     longer = max(inside.shape)
     joined = _closed(inside, max(1, round(CRACK * longer / 2)))
-    parts = _large_parts(joined, SMALLEST_PART)
+    parts = _large_parts(joined, smallest)
     solid = ~_large_holes(~parts, float("inf"))
     least = SMALLEST_HOLE * float(parts.sum())
     holes = _large_holes(solid & ~parts, least)
@@ -298,7 +330,7 @@ def _smoothed(inside: Bool) -> Float32:
     return np.clip(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.8), 0, 1)
 
 
-def _soft_edged(difference: Float32, seen: Bool, inside: Bool) -> Float32:
+def _soft_edged(difference: Float32, seen: Bool, inside: Bool, smallest: float) -> Float32:
     r"""Coverage along the outline, from how far each pixel is on its way to the object.
 
     A pixel that the object covers by :math:`\alpha` differs from the backdrop by
@@ -320,12 +352,12 @@ def _soft_edged(difference: Float32, seen: Bool, inside: Bool) -> Float32:
     ratio = np.clip(difference / np.maximum(object_difference, 1e-6), 0, 1)
     band = (cv2.dilate(solid, disc) > 0) & ~core
     soft = np.where(band & trusted, ratio, _smoothed(inside)).astype(np.float32)
-    return _without_specks(soft)
+    return _without_specks(soft, smallest)
 
 
-def _without_specks(coverage: Float32) -> Float32:
+def _without_specks(coverage: Float32, smallest: float) -> Float32:
     """Coverage without the single pixels that a ratio of dark values leaves behind."""
     solid = coverage > 0.5
-    parts = _large_parts(solid, SMALLEST_PART)
+    parts = _large_parts(solid, smallest)
     clean = ~_large_holes(~parts, SMALLEST_HOLE * float(parts.sum()))
     return np.where(clean == solid, coverage, clean).astype(np.float32)
