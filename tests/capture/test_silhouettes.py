@@ -85,7 +85,7 @@ class TestUniformBackdrop:
         assert overlap(made, truth) > 0.95
 
     def test_an_even_backdrop_is_taken_for_one_colour(self):
-        """Pieces that a surface fitted to cloth and shadows would leave are none of the object."""
+        """Pieces that a surface fitted to cloth would leave are none of the object."""
         truth, rng = disc(), np.random.default_rng(1)
         photograph = composed(truth, 0.5, 0.004 + rng.gamma(1.0, 0.004, (SIZE, SIZE, 1)))
         photograph[20:28, 130:138] = 0.08  # a small reflection on the cloth
