@@ -131,6 +131,6 @@ def test_given_directions_of_chrome_spheres_are_met(shared_data):
         lights, _ = lights_of_photographs(files, references)
         directions.append([light.direction for light in lights])
     mean = np.mean(directions, axis=0)
-    given = np.loadtxt(folder / "light_directions.txt").T
-    cosine = (mean * given).sum(axis=1) / np.linalg.norm(mean, axis=1)
+    stated = np.loadtxt(folder / "light_directions.txt").T
+    cosine = (mean * stated).sum(axis=1) / np.linalg.norm(mean, axis=1)
     assert np.degrees(np.arccos(cosine)).max() < 1

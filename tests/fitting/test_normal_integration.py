@@ -42,19 +42,19 @@ def test_known_heights_are_found_in_any_unit(scale):
     positions, up, graph = plane(scale)
     height, normals = bumps(positions, scale)
     fitted = FittedNormals(positions, up, normals, np.ones(len(up)))
-    found = integrated_displacements(fitted, graph, np.zeros(len(up)))
+    moves = integrated_displacements(fitted, graph, np.zeros(len(up)))
     # Ties draw hollows 12 texels long towards the hull, by some hundredths.
-    assert np.corrcoef(found, height)[0, 1] > 0.98
-    assert np.abs(found - height).max() < 0.25 * np.abs(height).max()
+    assert np.corrcoef(moves, height)[0, 1] > 0.98
+    assert np.abs(moves - height).max() < 0.25 * np.abs(height).max()
 
 
 def test_the_surface_stays_inside_of_the_hull():
     positions, up, graph = plane()
     height, normals = bumps(positions)
     fitted = FittedNormals(positions, up, normals, np.ones(len(up)))
-    found = integrated_displacements(fitted, graph, np.zeros(len(up)))
+    moves = integrated_displacements(fitted, graph, np.zeros(len(up)))
     # Of heights about zero half would be outside, by as much.
-    assert found.max() < 0.15 * np.abs(height).max()
+    assert moves.max() < 0.15 * np.abs(height).max()
 
 
 def test_normals_of_the_hull_move_nothing():

@@ -233,7 +233,7 @@ def test_the_equations_of_skews_are_those_of_a_dense_least_squares(small_rng):
     with ThreadPoolExecutor(1) as pool:
         linearised = table_fit._linearised(rows, model, pool)
         lobes = np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1))
-        found = table_fit._skews(linearised, model, (lobes, model.diffuse_table), pool)
+        solved = table_fit._skews(linearised, model, (lobes, model.diffuse_table), pool)
     free = np.tile(FREE_SKEWS, model.n_lobes)
     prior = np.kron(np.eye(model.n_lobes), table_fit.SKEW_PRIOR)
     prior *= table_fit.SKEW_TIE * rows.n_rows / SKEW_NODES
@@ -244,7 +244,7 @@ def test_the_equations_of_skews_are_those_of_a_dense_least_squares(small_rng):
         exact = np.clip(np.linalg.solve(matrix, right), -0.95, 0.95)
         # Differences of singles make the columns here, over a system of condition 1e4 or less.
         assert np.linalg.cond(matrix) < 1e4
-        np.testing.assert_allclose(found.reshape(n, 3)[free, c], exact, atol=5e-3)
+        np.testing.assert_allclose(solved.reshape(n, 3)[free, c], exact, atol=5e-3)
 
 
 def test_a_narrow_highlight_does_not_lift_the_dark(small_rng):
