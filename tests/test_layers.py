@@ -33,20 +33,13 @@ PACKAGES = (
     "api",
     "demo",
     "flags",
-    "cli_messages",
-    "cli_options",
-    "cli_check",
-    "cli_lights",
     "cli",
     "__main__",
 )
 # Commands import what they need when they run, so that --help answers at once and Ctrl-C
 # is heard while libraries are imported.
 IMPORTS_LATE = {
-    Path("reflfield/cli.py"),
-    Path("reflfield/cli_messages.py"),
-    Path("reflfield/cli_check.py"),
-    Path("reflfield/cli_lights.py"),
+    *(path.relative_to(ROOT) for path in (ROOT / "reflfield/cli").glob("*.py")),
     Path("reflfield/__main__.py"),
     Path("capture_sim/__main__.py"),
 }

@@ -36,7 +36,7 @@ SETTINGS = ("texture.largest=64", "hull.resolution=32", "relighting.samples_per_
 
 def watched(words):
     """Status of a command, and the largest resident memory of all its processes."""
-    process, peak = subprocess.Popen([sys.executable, "-m", "reflfield.cli", *words]), 0
+    process, peak = subprocess.Popen([sys.executable, "-m", "reflfield", *words]), 0
     while process.poll() is None:
         try:
             peak = max(peak, resident_bytes(psutil.Process(process.pid)))

@@ -125,7 +125,7 @@ def process_words(
     settings = [word for item in options.items() for word in ("--set", "{}={}".format(*item))]
     config = ("--config", arguments.config) if arguments.config else ()
     return [
-        *(sys.executable, "-m", "reflfield.cli", "run", capture, "-o", out),
+        *(sys.executable, "-m", "reflfield", "run", capture, "-o", out),
         *("--workers", arguments.workers, *config, *settings),
         *("--max-memory", arguments.max_memory, "--hold-out", "views=2,lights=2"),
     ]

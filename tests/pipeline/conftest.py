@@ -144,7 +144,7 @@ def finished(made_once, tiny_capture, tiny_options, subprocess_run):
 
     def fill(folder):
         outcome = subprocess_run(
-            *("-m", "reflfield.cli", "run", tiny_capture, "-o", folder),
+            *("-m", "reflfield", "run", tiny_capture, "-o", folder),
             *("--config", tiny_options, *HELD_OUT),
         )
         assert outcome.status == 0, outcome.err

@@ -14,9 +14,9 @@ import pytest
 from rich.console import Console
 
 import reflfield as package
-import reflfield.cli as cli
 from reflfield.capture.image_files import read_coverage
 from reflfield.capture.image_writing import write_exr, write_png
+from reflfield.cli.limits import GOES_ON
 from reflfield.errors import InputError
 from reflfield.render.exposure import object_pixels
 from reflfield.util import terminal
@@ -48,7 +48,7 @@ class TestHelp:
     def test_answers_before_the_libraries_are_loaded(self, words):
         # Processor time, not wall time: other work on the machine must not fail this.
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        command = [sys.executable, "-m", "reflfield.cli", *words]
+        command = [sys.executable, "-m", "reflfield", *words]
         subprocess.run(command, check=True, capture_output=True, timeout=60)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         spent = (after.ru_utime - before.ru_utime) + (after.ru_stime - before.ru_stime)
@@ -82,7 +82,7 @@ class TestExitStatus:
         monkeypatch.undo()
         assert outcome.status == status
         assert outcome.out == ""
-        assert outcome.err.splitlines() == [f"reflfield: {word}; {cli.GOES_ON}"]
+        assert outcome.err.splitlines() == [f"reflfield: {word}; {GOES_ON}"]
         stages = tmp_path / "out" / "stages"
         assert {p.name for p in stages.iterdir()} == {".lock", "files.json", "silhouettes"}
         assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
@@ -291,7 +291,7 @@ def test_inspect_counts(reflfield, finished, tiny_capture, what):
 @pytest.mark.timeout(1200)  # 3 minutes on two idle cores; tests share theirs
 def test_demo(subprocess_run, tmp_path):
     out = tmp_path / "demo"
-    outcome = subprocess_run("-m", "reflfield.cli", "demo", "-o", out, timeout=1150)
+    outcome = subprocess_run("-m", "reflfield", "demo", "-o", out, timeout=1150)
     assert outcome.status == 0, outcome.err
     assert [s for s in outcome.err.splitlines() if not s.endswith(" left")] == []
     assert (out / "capture" / "capture.json").is_file()

@@ -27,7 +27,7 @@ def test_large_frames_keep_below_the_ceiling_that_is_asked_for(
 ):
     def run(ceiling):
         return subprocess_run(
-            *("-m", "reflfield.cli", "run", large_capture, "-o", tmp_path / "out"),
+            *("-m", "reflfield", "run", large_capture, "-o", tmp_path / "out"),
             *("--config", tiny_options, "--hold-out", "photographs=1"),
             *("--max-memory", ceiling, "--set", "comparison.without_alignment=false"),
             *("--set", f"compression.model={model}"),

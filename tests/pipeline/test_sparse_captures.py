@@ -24,7 +24,7 @@ def product(tiny_capture, tiny_options, subprocess_run, tmp_path_factory):
     """A run of every view under every light, as far as the samples."""
     out = tmp_path_factory.mktemp("product") / "out"
     outcome = subprocess_run(
-        *("-m", "reflfield.cli", "run", tiny_capture, "-o", out, "--config", tiny_options),
+        *("-m", "reflfield", "run", tiny_capture, "-o", out, "--config", tiny_options),
         *("--until", "observations"),
     )
     assert outcome.status == 0, outcome.err

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from reflfield.cli_options import EncodingOption, LayerOption, Out
+from reflfield.cli.limits import NOTHING_LEFT
+from reflfield.cli.shared_options import EncodingOption, LayerOption, Out
 from reflfield.util.terminal import say, showing_progress
-
-NOTHING_LEFT = "nothing half-written is left"
 
 
 def lights(

@@ -8,12 +8,12 @@ from typing import Annotated
 
 import typer
 
-from reflfield.cli_options import EncodingOption, FollowLinks, Format, LayerOption, Out
+from reflfield.cli.limits import NOTHING_LEFT
+from reflfield.cli.shared_options import EncodingOption, FollowLinks, Format, LayerOption, Out
 from reflfield.util.terminal import say, showing_progress
 
 # Exit status by the severity of the gravest finding.
 STATUS = {"": 0, "note": 0, "warning": 1, "error": 2}
-NOTHING_LEFT = "nothing half-written is left"
 # Findings of one kind that are said one by one; the report has all.
 MOST_SAID = 5
 

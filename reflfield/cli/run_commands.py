@@ -1,0 +1,106 @@
+"""The commands that reconstruct a field: ``demo`` and ``run``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from reflfield.cli.limits import GOES_ON, limits, n_workers, working
+from reflfield.cli.messages import say_results
+from reflfield.cli.shared_options import (
+    EncodingOption,
+    FollowLinks,
+    Format,
+    LayerOption,
+    MaxMemory,
+    Out,
+    Workers,
+)
+
+
+def demo(
+    out: Out = Path("demo"),
+    workers: Workers = 0,
+) -> None:
+    """Simulate a small dome of a vase, process it, and compare with held-out photographs."""
+    from reflfield.demo import run_demo
+
+    started = time.perf_counter()
+    with working(GOES_ON):
+        result = run_demo(out, n_workers(workers))
+    say_results(result, started)
+
+
+def run(
+    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    out: Out,
+    config: Annotated[Path | None, typer.Option(help="Options in TOML.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="stage.option=value", help="One option; repeatable."),
+    ] = None,
+    hold_out: Annotated[
+        str,
+        typer.Option(
+            metavar="views=K,lights=K",
+            help="Kept for comparison; or views=K,light-cone=25deg, or photographs=K, or test: "
+            "the capture's test split.",
+        ),
+    ] = "",
+    size: Annotated[
+        str, typer.Option(metavar="2MB", help="Of the field; the best field of that size.")
+    ] = "",
+    psnr: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DB",
+            help="Of the field; the smallest that is as good. Status 3 if none is.",
+        ),
+    ] = None,
+    from_: Annotated[
+        str | None, typer.Option("--from", metavar="STAGE", help="Compute again from here.")
+    ] = None,
+    until: Annotated[str, typer.Option(metavar="STAGE", help="Stop after this.")] = "report",
+    workers: Workers = 0,
+    max_memory: MaxMemory = "4GB",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a dask cluster that computes the blocks."),
+    ] = None,
+    store: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Folder or fsspec URL for the texels' samples."),
+    ] = None,
+    format: Format = None,
+    follow_links: FollowLinks = False,
+    encoding: EncodingOption = None,
+    layer: LayerOption = None,
+) -> None:
+    """Make a relightable field of a capture, with a report.
+
+    Status 0: done. 2: input cannot be used. 3: done, but --psnr is not reached. 130: Ctrl-C.
+    """
+    from reflfield.api.captures import open_capture
+    from reflfield.api.reconstruction import read_options, reconstruct
+    from reflfield.options import parse_hold_out, size_settings
+
+    started = time.perf_counter()
+    options = read_options(config, [*(set_ or []), *size_settings(size, psnr)])
+    resources = limits(workers, max_memory, scheduler, store)
+    held = parse_hold_out(hold_out)
+    if scheduler is not None:  # whose workers run in folders of their own
+        capture = capture.resolve()
+    photographed = open_capture(
+        *(capture, format),
+        encoding=encoding,
+        layer=layer,
+        follow_links=follow_links,
+        test_split=held.test,
+    )
+    asked: dict[str, Any] = {"options": options, "hold_out": held, "resources": resources}
+    with working(GOES_ON):
+        result = reconstruct(photographed, out, **asked, from_stage=from_, until=until)
+    say_results(result, started)
