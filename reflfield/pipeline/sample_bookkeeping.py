@@ -118,16 +118,20 @@ def _texels(context: Context, counts: dict[str, dict[str, Any]]) -> Iterator[Cou
 
 
 def _aligned_texels(counts: dict[str, dict[str, Any]], n: int) -> Iterator[CountedItems]:
-    """Texels through completion and alignment."""
-    completed = counts["completion"]
-    unseen = completed["texels without samples"]
-    yield CountedItems(
-        "completion",
-        "texels",
-        n,
-        {"completed": completed["texels completed"], "without samples": unseen},
-    )
+    """Texels through completion, if any, and alignment."""
     aligned = counts["alignment"]
+    unseen = n - aligned["texels aligned"] - aligned["texels that keep the base frame"]
+    if "completion" in counts:  # of one view there is none
+        completed = counts["completion"]
+        yield CountedItems(
+            "completion",
+            "texels",
+            n,
+            {
+                "completed": completed["texels completed"],
+                "without samples": completed["texels without samples"],
+            },
+        )
     yield CountedItems(
         "alignment",
         "texels",

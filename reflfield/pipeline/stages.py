@@ -180,13 +180,13 @@ COMPLETION = Stage(
     completion.write_completion,
     after=(OBSERVATIONS,),
     options=lambda options: (options.completion, options.resampling, options.seed),
-    wanted=lambda context: context.options.aligns,
+    wanted=lambda context: context.options.aligns and not context.photometric,
 )
 # one local frame per texel
 ALIGNMENT = Stage(
     "alignment",
     alignment.write_alignment,
-    after=(COMPLETION,),
+    after=(OBSERVATIONS, COMPLETION),
     options=lambda options: (options.alignment, options.seed),
     wanted=lambda context: context.options.aligns,
 )
@@ -198,6 +198,9 @@ RESAMPLING = Stage(
     options=lambda options: (
         options.compression.rank,
         options.compression.training_texels,
+        options.compression.fit,
+        options.compression.n_components,
+        options.compression.size > 0 or options.compression.psnr > 0,
         options.seed,
     ),
     wanted=lambda context: context.options.aligns,
