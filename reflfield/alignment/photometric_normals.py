@@ -2,13 +2,13 @@ r"""Normals of texels that one view shows under many lights, by photometric ster
 
 The luminance of a texel under light j is taken for
 
-.. math:: y_j = (n \cdot l_j)_+ \Big( a + \sum_k w_k D_k(n \cdot h_j) G_k(n \cdot l_j, n \cdot v)
-          \Big),
+.. math:: y_j = (n \cdot l_j)_+ \Big( a + \tfrac14 V \sum_k w_k D_k(n \cdot h_j) \Big),
 
 a matt part and lobes about the half vector h of light and view: D is the distribution of GGX
-of a few roughnesses and G its masking over the cosines of light and view (Smith), and a and w
-are not negative. Lobes stand upright on the normal. Seen from one side, lobes that any
-function of the half vector could be would leave a common lean of all normals undetermined.
+of a few roughnesses, V = 1 / (l + v - l v) with the cosines l and v of light and view, as in
+`field.half_vector`, and a and w are not negative. Lobes stand upright on the normal. Seen from
+one side, lobes that any function of the half vector could be would leave a common lean of all
+normals undetermined.
 
 Of each texel the normal and the weights are found by Gauss-Newton steps with weights that
 bound shadows and interreflections, from several beginnings, the best of which goes on.
@@ -39,12 +39,14 @@ FAST = {"reassoc", "contract", "arcp", "nsz"}
 # Roughnesses of the lobes.
 ROUGHNESSES = (0.08, 0.2, 0.45)
 N_WEIGHTS = 1 + len(ROUGHNESSES)
-# Steps from every beginning, and then from the best.
-FIRST_STEPS, MORE_STEPS = 1, 6
+# Most steps from the best beginning.
+MOST_STEPS = 7
 # A smaller step is the last one, radians.
 SMALL_STEP = 1e-3
 # Residuals of square roots, over the root of the brightest value, that count by half.
 USUAL_RESIDUAL = np.float32(0.08)
+# Of fewer lights lobes must earn their place: they would explain what is wrong with the lights.
+FEW_LIGHTS = 40
 # Largest tilt of one step, radians, and the least cosine of normal and view.
 LARGEST_STEP, LEAST_COSINE = np.float32(0.25), np.float32(0.05)
 # Share of the brightest value at which a light counts for the matt beginning.
@@ -76,15 +78,13 @@ def _terms(normal: Any, view: Any, light: Any, parts: Any, slopes: Any) -> None:
     scale = _ONE / np.sqrt(hx * hx + hy * hy + hz * hz + np.float32(1e-12))
     half = (normal[0] * hx + normal[1] * hy + normal[2] * hz) * scale
     parts[0], slopes[0, 0], slopes[0, 1] = cosine, _ONE, _ZERO
+    spread = np.float32(0.25) / (cosine + towards - cosine * towards + np.float32(1e-3))
     for k in range(len(_ALPHA2)):
         alpha2 = _ALPHA2[k]
         rest = half * half * (alpha2 - _ONE) + _ONE
-        root = np.sqrt(alpha2 + (_ONE - alpha2) * cosine * cosine)
-        scale_light = _ONE / (cosine + root)
-        scale_view = _ONE / (towards + np.sqrt(alpha2 + (_ONE - alpha2) * towards * towards))
-        lobe = alpha2 / (rest * rest) * scale_light * scale_view
+        lobe = spread * alpha2 / (rest * rest)
         parts[1 + k] = cosine * lobe
-        slopes[1 + k, 0] = lobe * scale_light * alpha2 / root
+        slopes[1 + k, 0] = lobe
         slopes[1 + k, 1] = parts[1 + k] * np.float32(4.0) * half * (_ONE - alpha2) / rest
 
 
@@ -110,7 +110,9 @@ def _trust(value: Any, shown: Any, unit: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _step(values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
+def _step(
+    values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int
+) -> Any:
     """Improve normal and weights once; sum of squares before, and the angle moved."""
     normal, weights = state
     parts, slopes, matrix, right = room
@@ -146,30 +148,33 @@ def _step(values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any)
             right[k] += scaled * rest
             for m in range(k + 1):
                 matrix[k, m] += scaled * line[m]
-    return error, _move(state, tangent, binormal, matrix, right)
+    return error, _move(state, tangent, binormal, matrix, right, n_free)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _complete(weights: Any, matrix: Any, right: Any) -> None:
-    """Fill the upper triangle, add the tie, and hold weights at zero that would fall."""
+def _complete(weights: Any, matrix: Any, right: Any, n_free: int) -> None:
+    """Fill the upper triangle, add the tie, and hold weights at zero that would fall.
+
+    So are all but the first `n_free`.
+    """
     n = len(right)
     for k in range(n):
         matrix[k, k] += RIDGE * matrix[k, k] + 1e-12
         for m in range(k):
             matrix[m, k] = matrix[k, m]
     for k in range(len(weights)):
-        if weights[k] <= _ZERO and right[k] <= 0.0:
+        if k >= n_free or (weights[k] <= _ZERO and right[k] <= 0.0):
             matrix[k, :] = 0.0
             matrix[:, k] = 0.0
             matrix[k, k], right[k] = 1.0, 0.0
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _move(state: Any, tangent: Any, binormal: Any, matrix: Any, right: Any) -> Any:
+def _move(state: Any, tangent: Any, binormal: Any, matrix: Any, right: Any, n_free: int) -> Any:
     """Take a bounded Gauss-Newton step; weights stay non-negative. Its angle, radians."""
     normal, weights = state
     n = len(weights)
-    _complete(weights, matrix, right)
+    _complete(weights, matrix, right, n_free)
     if not cholesky_factor(matrix, n + 2):
         return 0.0
     solve_vector(matrix, right)
@@ -236,24 +241,29 @@ def _mirror_normal(values: Any, lights: Any, view: Any, least: Any, normal: Any)
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
 def _start_weights(
     values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any
-) -> None:
-    """Weights that fit best at a normal."""
+) -> Any:
+    """Set the weights that fit best at a normal; the sum of squares that they leave."""
     normal, weights = state
     parts, slopes, matrix, right = room
     n = len(weights)
     matrix[:] = 0.0
     right[:] = 0.0
+    error = 0.0
     for j in range(len(values)):
         if np.isnan(values[j]):
             continue
         _terms(normal, view, lights[j], parts, slopes)
         trust = _ONE / (np.float32(2.0) * max(values[j], _ZERO) + np.float32(0.02) * unit)
+        error += trust * values[j] * values[j]
         for k in range(n):
             right[k] += trust * parts[k] * values[j]
             for m in range(n):
                 matrix[k, m] += trust * parts[k] * parts[m]
     weights[:] = _ZERO
     _solve_weights(matrix, right, weights)
+    for k in range(n):
+        error -= weights[k] * right[k]
+    return error
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -268,20 +278,51 @@ def _brightest(values: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
 def _best_start(values: Any, lights: Any, view: Any, unit: Any, states: Any, room: Any) -> int:
-    """Beginning with the least error after a few steps; -1 if none faces the camera."""
+    """Beginning with the least error; -1 if none faces the camera."""
     starts, weights = states
     best, least = -1, np.inf
     for s in range(len(starts)):
         if _facing(starts[s], view) < LEAST_COSINE:
             continue
         state = starts[s], weights[s]
-        _start_weights(values, lights, view, unit, state, room)
-        error = 0.0
-        for _ in range(FIRST_STEPS):
-            error, _ = _step(values, lights, view, unit, state, room)
+        error = _start_weights(values, lights, view, unit, state, room)
         if error < least:
             best, least = s, error
     return best
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _converge(
+    values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int
+) -> Any:
+    """Take steps until they are small; the sum of squares before the last."""
+    moved, step, error = np.inf, 0, 0.0
+    while moved >= SMALL_STEP and step < MOST_STEPS:
+        error, moved = _step(values, lights, view, unit, state, room, n_free)
+        step += 1
+    return error
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _matt_fit(values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
+    """Fit of the matt part alone from the normal of a matt surface; its sum of squares."""
+    normal, weights = state
+    if _facing(normal, view) < LEAST_COSINE:
+        return np.inf
+    _start_weights(values, lights, view, unit, state, room)
+    weights[1:] = _ZERO
+    return _converge(values, lights, view, unit, state, room, 1)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _suffices(matt: Any, glossy: Any, values: Any) -> Any:
+    """Whether a matt part explains values as well as lobes do, by Schwarz's criterion."""
+    n = 0
+    for value in values:
+        n += not np.isnan(value)
+    return n * np.log(max(matt, 1e-30)) < n * np.log(max(glossy, 1e-30)) + (
+        N_WEIGHTS - 1
+    ) * np.log(max(n, 1))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -304,10 +345,15 @@ def _fit_texels(values: Any, lights: Any, views: Any, normals: Any, residuals: A
         best = _best_start(values[t], lights[t], view, unit, (starts, weights), room)
         if best < 0:
             continue
-        state, moved, step = (starts[best], weights[best]), np.inf, 0
-        while moved >= SMALL_STEP and step < MORE_STEPS:
-            residuals[t], moved = _step(values[t], lights[t], view, unit, state, room)
-            step += 1
+        state = starts[best], weights[best]
+        residuals[t] = _converge(values[t], lights[t], view, unit, state, room, n)
+        if values.shape[1] < FEW_LIGHTS:
+            other = (best + 1) % len(starts)
+            matt = starts[other], weights[other]
+            _matt_normal(values[t], lights[t], MATT_SHARE * unit, matt[0])
+            error = _matt_fit(values[t], lights[t], view, unit, matt, room)
+            if _suffices(error, residuals[t], values[t]):
+                best, residuals[t] = other, error
         if _facing(starts[best], view) >= LEAST_COSINE:
             normals[t] = starts[best]
 

