@@ -146,6 +146,8 @@ class CompressionOptions:
         >>> options.n_clusters, options.n_components
         (12, 4)
         """
+        if "auto" not in (self.n_clusters, self.n_components):
+            return self
         return replace(
             self,
             n_clusters=clusters if self.n_clusters == "auto" else self.n_clusters,

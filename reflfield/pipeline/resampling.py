@@ -49,6 +49,14 @@ def fits_in_one_pass(context: Context, options: CompressionOptions) -> bool:
     return context.photometric and options.fits_samples(n) and not searches
 
 
+def texels_read(context: Context) -> dict[str, str]:
+    """Which texels of one view are completed, as the key of the stage has it."""
+    if not context.photometric:
+        return {}
+    few = fits_in_one_pass(context, context.options.compression)
+    return {"texels completed": "those of the basis" if few else "all"}
+
+
 def write_resampling(context: Context, folder: Path) -> dict[str, Any]:
     """Resample raw samples in the aligned frames, and fill what was not observed."""
     texels = resampled(

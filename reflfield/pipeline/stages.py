@@ -198,11 +198,9 @@ RESAMPLING = Stage(
     options=lambda options: (
         options.compression.rank,
         options.compression.training_texels,
-        options.compression.fit,
-        options.compression.n_components,
-        options.compression.size > 0 or options.compression.psnr > 0,
         options.seed,
     ),
+    reads=resampling.texels_read,
     wanted=lambda context: context.options.aligns,
 )
 # model fitted to the raw samples, and to the photographs -> field file
