@@ -9,6 +9,7 @@ from pathlib import Path
 
 from reflfield.capture.capture import Capture
 from reflfield.options import HoldOut, Resources
+from reflfield.pipeline.hold_out import counted
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.tradeoff.cost_fit import fit_costs
 from reflfield.tradeoff.measured_ladder import measured_ladder
@@ -52,7 +53,7 @@ def plan(
     return plan_run(capture, options or PipelineOptions(), hold_out, resources)
 
 
-def tradeoff(
+def measure_tradeoff(
     capture: Capture,
     out: Path | str,
     *,
@@ -104,7 +105,7 @@ def tradeoff(
     result = sweep.run(tell)
     fit = fit_costs(result, sweep.share, sweep.costs, sweep.slowness)
     write_tradeoff(folder, result, fit)
-    tell(f"{len(result.measured)} runs in {time.perf_counter() - started:.0f} s")
+    tell(f"{counted(len(result.measured), 'run')} in {time.perf_counter() - started:.0f} s")
     return result
 
 
@@ -127,8 +128,8 @@ def options_within(
     hold_out, options, resources
         As of `reconstruct`.
     measured : Path or str, optional
-        Folder of a `tradeoff` of the capture, whose front is chosen from; else it is one of the
-        presets.
+        Folder of a `measure_tradeoff` of the capture, from whose front one is chosen; without,
+        one of the presets.
 
     Returns
     -------

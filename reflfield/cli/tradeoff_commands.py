@@ -92,7 +92,7 @@ def tradeoff(
     Photographs are kept apart twice: to choose settings on, and to report what was chosen.
     """
     from reflfield.api.reconstruction import read_options
-    from reflfield.api.tradeoffs import tradeoff as sweep_capture
+    from reflfield.api.tradeoffs import measure_tradeoff
     from reflfield.options import parse_hold_out, parse_seconds
 
     asked: dict[str, Any] = {
@@ -105,7 +105,7 @@ def tradeoff(
     test = asked["hold_out"].test
     photographed = _opened(capture, format, encoding, layer, follow_links, test)
     with working(GOES_ON):
-        sweep_capture(photographed, out, **asked, tell=say)
+        measure_tradeoff(photographed, out, **asked, tell=say)
     say(str(out / "index.html"))
     say(str(out / "tradeoff.json"))
 

@@ -151,7 +151,8 @@ def marked_curves(
             shown = [
                 m for m in marks if _plottable([m.x], [m.y], log_x=log_x, log_y=False).size
             ]
-            x, y, errors = ([getattr(m, a) for m in shown] for a in ("x", "y", "y_error"))
+            x, y = [mark.x for mark in shown], [mark.y for mark in shown]
+            errors = [mark.y_error for mark in shown]
             line = "-" if name in joined else ""
             axes.plot(x, y, line, color=colour, label=name, marker="o", markersize=3.5)
             axes.errorbar(x, y, errors, fmt="none", ecolor=colour, elinewidth=0.8, alpha=0.5)

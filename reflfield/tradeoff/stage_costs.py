@@ -2,8 +2,8 @@
 
 CPU time, memory and disk of a stage are sums of amounts of work (`work_of`, `memory_of`,
 `disk_of`) times what a unit of each takes. These unit costs are fitted to runs that have been
-measured (`fitted`), by non-negative least squares of relative errors: a stage is to be
-predicted within a factor, whatever its size. Times are those of a reference machine;
+measured (`fitted`), by least squares of the logarithm of predicted over measured: a stage is to
+be predicted within a factor, whatever its size. Times are those of a reference machine;
 `machine_speed` compares this one with it.
 """
 
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import least_squares, nnls
 
 from reflfield.errors import InputError
 from reflfield.field.clustered_pca import HALF_VECTOR
@@ -457,15 +457,28 @@ def _fitted_units(
     least: float,
     prior: Amounts | None,
 ) -> dict[str, float]:
-    """Non-negative unit costs of the least relative error."""
+    """Non-negative unit costs of the least squared logarithm of predicted over measured.
+
+    The relative error alone would favour predictions that are too low. It is where the search
+    starts.
+    """
     names = sorted({name for row in amounts for name in row} | set(prior or ()))
     matrix = np.array([[row.get(name, 0.0) for name in names] for row in amounts])
+    known = np.array([(prior or {}).get(name, 0.0) for name in names])
     weight = 1 / (costs + least)
-    system, target = matrix * weight[:, None], costs * weight
-    if prior is not None:
-        known = np.array([prior.get(name, 0.0) for name in names])
-        scale = PRIOR_WEIGHT / np.maximum(known, 1e-9)
-        held = np.diag(np.where(known > 0, scale, 0.0))
-        system, target = np.vstack([system, held]), np.concatenate([target, held @ known])
-    solution, _ = nnls(system, target)
-    return {name: float(f"{u:.6g}") for name, u in zip(names, solution, strict=True) if u > 0}
+    start, _ = nnls(
+        np.vstack([matrix * weight[:, None], np.diag(known > 0) * PRIOR_WEIGHT]),
+        np.concatenate([costs * weight, known * PRIOR_WEIGHT]),
+        maxiter=100 * len(names),
+    )
+    held = known > 0
+    scale = np.maximum(np.maximum(known, start), 1e-3 * np.max(start, initial=1e-9))
+
+    def residuals(relative: np.ndarray) -> np.ndarray:
+        predicted = matrix @ (relative * scale) + least
+        from_prior = PRIOR_WEIGHT * (relative[held] * scale[held] / known[held] - 1)
+        return np.concatenate([np.log(predicted * weight), from_prior])
+
+    solution = least_squares(residuals, start / scale, bounds=(0, np.inf))
+    units = solution.x * scale
+    return {name: float(f"{u:.6g}") for name, u in zip(names, units, strict=True) if u > 0}

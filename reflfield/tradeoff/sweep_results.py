@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import zip_longest
 from statistics import median
 from typing import Any
 
@@ -156,6 +157,8 @@ def front_of(points: Sequence[tuple[float, float]]) -> list[int]:
 def better_half(points: Sequence[tuple[float, float]]) -> list[int]:
     """Indices of half of the points, rounded up: of the front first, then of the next one.
 
+    Of the last front with a place, from both of its ends: the best, the cheapest, and so on.
+
     Examples
     --------
     >>> better_half([(1.0, 20.0), (2.0, 19.0), (3.0, 25.0), (4.0, 24.0)])
@@ -164,7 +167,9 @@ def better_half(points: Sequence[tuple[float, float]]) -> list[int]:
     left, kept = list(range(len(points))), []
     while left:
         front = [left[i] for i in front_of([points[i] for i in left])]
-        kept += front
+        half = len(front) // 2
+        ends = zip_longest(reversed(front[half:]), front[:half])
+        kept += [i for pair in ends for i in pair if i is not None]
         left = [i for i in left if i not in front]
     return sorted(kept[: -(-len(points) // 2)])
 

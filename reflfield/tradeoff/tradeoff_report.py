@@ -139,14 +139,12 @@ def picks_section(result: SweepResult) -> Section:
                 _mean(measured, "reported"),
                 _mean(measured, "unseen"),
                 format_seconds(measured.cpu_seconds),
-                format_seconds(measured.seconds),
-                format_bytes(measured.peak_bytes),
                 format_bytes(measured.field_bytes),
             )
         )
     header = (
         *("pick", "configuration", "chosen on, dB", "gain, dB", "reported, dB", "unseen, dB"),
-        *("CPU", "time", "memory", "field"),
+        *("CPU", "field"),
     )
     table = Table(
         header,

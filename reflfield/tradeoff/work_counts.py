@@ -54,8 +54,8 @@ class WorkCounts:
         Texels times photographs, seen or not.
     n_nodes : int
         Of the common grid of directions.
-    n_compared, compared_pixels : int
-        Photographs that the field is compared with, and their pixels.
+    compared_pixels : int
+        Of the photographs that the field is compared with.
     n_made : int
         Silhouettes that are made from photographs.
     model : {"half_vector", "clustered"}
@@ -79,7 +79,6 @@ class WorkCounts:
     texture_side: float
     n_samples: float
     n_nodes: int
-    n_compared: int
     compared_pixels: int
     n_made: int
     model: str
@@ -158,7 +157,6 @@ def counts_of(context: Context, share: float | None = None) -> WorkCounts:
         texture_side=side,
         n_samples=n_texels * len(training.photographs),
         n_nodes=view_side**2 * light_side**2,
-        n_compared=sum(map(len, compared)),
         compared_pixels=sum(map(sum, compared)),
         n_made=0 if context.is_plane else _n_made(training),
         model=model,
