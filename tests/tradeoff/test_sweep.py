@@ -11,7 +11,7 @@ from reflfield.options import Resources
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.tradeoff.cost_fit import fit_costs
 from reflfield.tradeoff.measured_ladder import measured_ladder
-from reflfield.tradeoff.sweep_results import better_half, front_of, gain, paths, picks
+from reflfield.tradeoff.sweep_results import Measured, better_half, front_of, gain, paths, picks
 from reflfield.tradeoff.swept_options import (
     SWEPT,
     Configuration,
@@ -140,12 +140,28 @@ def test_repeats_show_the_scatter_of_the_times(fake_runs, make_sweep):
     assert len(picks(result)["best"].repeats) == 2
 
 
-def test_paths_begin_with_what_costs_least(fake_runs, make_sweep):
-    fake_runs()
-    result = make_sweep().run()
-    alone = [m for m in result.measured if m.stage_of_sweep == "alone"]
-    for configuration in paths(result.default, alone):
-        assert 1 < len(configuration.settings) <= 4
+def run_with(cpu, psnr, changed=None):
+    """A run that has taken so much and is so good."""
+    stage = {"name": "surface", "cpu_seconds": cpu, "seconds": cpu, "reused": False}
+    outcome = {"stages": [stage], "chosen on": {"psnr": [psnr]}}
+    return Measured(Configuration(), outcome, changed)
+
+
+def test_paths_begin_with_what_pays_most():
+    alone = [
+        run_with(5.0, 29.0, ("hull.resolution", 96)),  # half of the time for 1 dB
+        run_with(5.0, 27.0, ("alignment.iterations", 1)),  # half for 3 dB
+        run_with(2.5, 29.5, ("completion.rank", 6)),  # a quarter for half a dB
+        run_with(20.0, 31.0, ("compression.rank", 32)),  # twice for 1 dB
+        run_with(20.0, 33.0, ("compression.n_clusters", 16)),  # twice for 3 dB
+        run_with(20.0, 29.0, ("completion.passes", 8)),  # twice for nothing
+    ]
+    combined = [[name for name, _ in c.settings] for c in paths(run_with(10.0, 30.0), alone)]
+    assert combined == [
+        ["completion.rank", "hull.resolution"],
+        ["alignment.iterations", "completion.rank", "hull.resolution"],
+        ["compression.n_clusters", "compression.rank"],
+    ]
 
 
 def test_a_gain_has_the_error_of_images_that_are_the_same(fake_runs, make_sweep):
