@@ -216,7 +216,9 @@ class StabilityTable:
     def pytest_runtest_logreport(self, report):
         """Keep what a finished test has recorded."""
         if report.when == "call":
-            self.records += [value for name, value in report.user_properties if name == PROPERTY]
+            self.records += [
+                value for name, value in report.user_properties if name == PROPERTY
+            ]
         if report.when == "call" or report.outcome != "passed":
             self.outcomes[report.nodeid] = report.outcome
 
@@ -240,7 +242,9 @@ class StabilityTable:
         from tests.benchmarks.measuring import Results
 
         results = Results(self.path.stem, "Hard cases: what is bounded and observed", MODULES)
-        results.table("Worst of all tests of a bound; two bounds are those of the two precisions")
+        results.table(
+            "Worst of all tests of a bound; two bounds are those of the two precisions"
+        )
         for row in rows:
             results.add(row)
         return results.write(self.path.parent, "python -m pytest -m stability")

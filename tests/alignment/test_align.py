@@ -197,7 +197,10 @@ def test_texels_that_determine_nothing_get_the_base_frame_and_no_score(
         dtype=np.float32,
     )
     grams = result.local_from_base @ np.swapaxes(result.local_from_base, 1, 2)
-    for texel, case in ((2, "one observed sample"), (3, "one specular peak a million times the rest")):
+    for texel, case in (
+        (2, "one observed sample"),
+        (3, "one specular peak a million times the rest"),
+    ):
         bounded.at_most(
             np.abs(grams[texel] - np.eye(3)),
             rounding(np.float64, operations=32),

@@ -122,9 +122,7 @@ def test_float32_and_float64_find_the_same(rng, bounded):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_half_turn_symmetry_has_two_equal_peaks_and_a_margin_that_knows_it(
-    dtype, rng, bounded
-):
+def test_half_turn_symmetry_has_two_equal_peaks_and_a_margin_that_knows_it(dtype, rng, bounded):
     target = couple(lobes(rng, 1, 5).astype(dtype))
     half = turned(target, np.diag([-1.0, -1.0, 1.0])[None])
     both = Coupled(
@@ -258,7 +256,9 @@ def test_noise_and_gaps_move_frames_by_little(scene, rng, bounded):
     samples = scene.sample_texels(frames, d, d)
     noise = 0.02 * samples.max() * rng.standard_normal(samples.shape, np.float32)
     hidden = rng.random(samples.shape) < 0.5
-    observed = np.where(hidden, rng.choice([np.nan, np.inf, -np.inf], samples.shape), samples + noise)
+    observed = np.where(
+        hidden, rng.choice([np.nan, np.inf, -np.inf], samples.shape), samples + noise
+    )
     alignment = align(observed.astype(np.float32), d, d, refine=False)
     again = align(np.where(hidden, np.nan, observed).astype(np.float32), d, d, refine=False)
     bounded.at_most(

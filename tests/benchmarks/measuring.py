@@ -175,7 +175,9 @@ class Results:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.name}.json"
         with replacing(path) as partial:
-            partial.write_text(json.dumps(self.to_dict(written_by), indent=1, allow_nan=False) + "\n")
+            partial.write_text(
+                json.dumps(self.to_dict(written_by), indent=1, allow_nan=False) + "\n"
+            )
         return path
 
     def to_dict(self, written_by=None):
