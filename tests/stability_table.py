@@ -91,6 +91,7 @@ STAGE_OF = {case: (page, stage) for (page, stage), cases in CASES.items() for ca
 PROPERTY = "stability"
 COLUMNS = ("case", "stage", "bounded", "bound", "from", "float32", "float64")
 DTYPES = {"float32", "float64"}
+MOST_NAMES = 8
 
 
 class Bounded:
@@ -234,7 +235,8 @@ class StabilityTable:
         counts = ", ".join(f"{outcomes.count(o)} {o}" for o in sorted(set(outcomes)))
         terminalreporter.write_line(f"{len(rows)} bounds; tests of degenerate input: {counts}")
         if missing := missing_cases(rows):
-            terminalreporter.write_line(f"without a figure in this run: {', '.join(missing)}")
+            names = ", ".join(missing[:MOST_NAMES]) + ", ..." * (len(missing) > MOST_NAMES)
+            terminalreporter.write_line(f"{len(missing)} cases without a figure: {names}")
         terminalreporter.write_line(f"written: {self.write(rows)}")
 
     def write(self, rows):
