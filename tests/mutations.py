@@ -4,9 +4,10 @@
     python tests/mutations.py --only wigner gauss # those whose module's name has one of these
     python tests/mutations.py --list
 
-Each fault, of `data/mutations.toml`, is one exact replacement of text. It is planted in a copy of the repository in a
-temporary folder, never in the working tree, and only the tests of its module run there. A fault
-that no test finds survives: the tests lack something. Exit status 1 where one survives.
+Each fault, of `data/mutations.toml`, is one exact replacement of text. It is planted in a copy
+of the repository in a temporary folder, never in the working tree, and only the tests of its
+module run there. A fault that no test finds survives: the tests lack something. Exit status 1
+where one survives.
 `test_mutations.py` holds that every text still occurs exactly once.
 """
 
@@ -85,24 +86,29 @@ def copy_tree(folder: Path) -> None:
             shutil.copy2(source, folder / name)
 
 
+def module_of(dotted: str) -> Path | None:
+    """Module that an imported name is of, below the root; None outside the package."""
+    parts = dotted.split(".")
+    for end in range(len(parts), 0, -1):
+        path = Path(*parts[:end])
+        for candidate in (path.with_suffix(".py"), path / "__init__.py"):
+            if (ROOT / candidate).is_file():
+                return candidate
+    return None
+
+
 def importers(module: str) -> set[Path]:
     """Modules of the package that import one, directly or through others, and itself."""
-    name = f"reflfield.{module.replace('/', '.')}"
-    direct = {path: {one.module for one in imports_in(path)} for path in modules("reflfield")}
-    reached, names = {Path("reflfield", f"{module}.py")}, {name}
-    while True:
-        more = {
-            path
-            for path, imported in direct.items()
-            if path not in reached
-            and any(one == n or one.startswith(f"{n}.") for one in imported for n in names)
-        }
-        if not more:
-            return reached
+    direct = {
+        path: {module_of(one.module) for one in imports_in(path)}
+        for path in modules("reflfield")
+    }
+    reached: set[Path] = set()
+    more = {Path("reflfield", f"{module}.py")}
+    while more:
         reached |= more
-        names |= {
-            ".".join(path.with_suffix("").parts).removesuffix(".__init__") for path in more
-        }
+        more = {path for path, imported in direct.items() if imported & reached} - reached
+    return reached
 
 
 def forget_compiled(folder: Path, module: str) -> None:
