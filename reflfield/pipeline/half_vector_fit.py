@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from reflfield.errors import InputError
-from reflfield.field.build import BaseSurface, Quantisation
+from reflfield.field.build import Quantisation
 from reflfield.field.file import write_field
 from reflfield.field.half_vector import HalfVectorModel, HalfVectorOptions
 from reflfield.field.half_vector_build import build_half_vector_field
@@ -292,15 +292,9 @@ class HalfVectorFit:
 
     def build(self, model: HalfVectorModel, step: float) -> HalfVectorField:
         """Quantise a model in units of white on the base surface into a field."""
-        context, atlas = self.context, results.atlas(self.context)
-        surface = BaseSurface(
-            positions=atlas.positions,
-            faces=atlas.faces,
-            uv=atlas.uv,
-            texel_of_pixel=results.texels(context).texel_of_pixel,
-        )
+        context = self.context
         return build_half_vector_field(
-            surface,
+            results.base_surface(context),
             in_samples(model, self.white),
             results.indirect_light(context),
             domain=context.options.resampling.domain,  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
+from reflfield.field.build import BaseSurface
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
@@ -98,6 +99,17 @@ def atlas(context: Context) -> Atlas:
 def texels(context: Context) -> TexelTable:
     """Position, base frame and area of each texel."""
     return texel_table(atlas(context))
+
+
+def base_surface(context: Context) -> BaseSurface:
+    """Mesh, atlas and texels of the base surface, as a field holds them."""
+    stored = atlas(context)
+    return BaseSurface(
+        positions=stored.positions,
+        faces=stored.faces,
+        uv=stored.uv,
+        texel_of_pixel=texels(context).texel_of_pixel,
+    )
 
 
 @cached("visibility")
