@@ -40,18 +40,15 @@ from typing import Any as _Any
 if _TYPE_CHECKING:
     from reflfield.alignment.align_texels import Alignment, align
     from reflfield.alignment.refinement import RefinementOptions
-    from reflfield.api.captures import (
-        convert_btf,
-        convert_capture,
-        describe_capture,
-        open_capture,
-    )
+    from reflfield.api.captures import describe_capture, open_capture
     from reflfield.api.example import example_field
     from reflfield.api.fields import Field, open_field
     from reflfield.api.images import compare, relight, render_turntable
     from reflfield.api.reconstruction import Result, read_options, reconstruct
+    from reflfield.api.tradeoffs import measure_tradeoff, options_within, plan
     from reflfield.capture.cameras import Camera
     from reflfield.capture.capture import Capture
+    from reflfield.capture.conversion import convert_btf, convert_capture
     from reflfield.capture.lights import DirectionalLight, Light, PointLight
     from reflfield.errors import (
         CaptureError,
@@ -68,7 +65,9 @@ if _TYPE_CHECKING:
     from reflfield.geometry.occlusion import VisibilityOptions
     from reflfield.geometry.uv_atlas import AtlasOptions
     from reflfield.geometry.visual_hull import HullOptions
-    from reflfield.observations.frame_resampling import ResamplingOptions
+    from reflfield.observations.resampling_options import (
+        ResamplingOptions,
+    )
     from reflfield.options import HoldOut, Resources
     from reflfield.pipeline.pipeline_options import (
         AlignmentOptions,
@@ -125,8 +124,11 @@ __all__ = [
     "convert_capture",
     "describe_capture",
     "example_field",
+    "measure_tradeoff",
     "open_capture",
     "open_field",
+    "options_within",
+    "plan",
     "read_options",
     "reconstruct",
     "relight",
@@ -135,15 +137,15 @@ __all__ = [
 
 # Module of each name; type checkers see the imports above.
 _MODULES = {
+    "reflfield.capture.conversion": ("convert_btf", "convert_capture"),
     "reflfield.alignment.align_texels": ("Alignment", "align"),
     "reflfield.alignment.refinement": ("RefinementOptions",),
-    "reflfield.api.captures": (
-        *("convert_btf", "convert_capture", "describe_capture", "open_capture"),
-    ),
+    "reflfield.api.captures": ("describe_capture", "open_capture"),
     "reflfield.api.example": ("example_field",),
     "reflfield.api.fields": ("Field", "open_field"),
     "reflfield.api.images": ("compare", "relight", "render_turntable"),
     "reflfield.api.reconstruction": ("Result", "read_options", "reconstruct"),
+    "reflfield.api.tradeoffs": ("measure_tradeoff", "options_within", "plan"),
     "reflfield.capture.cameras": ("Camera",),
     "reflfield.capture.capture": ("Capture",),
     "reflfield.capture.lights": ("DirectionalLight", "Light", "PointLight"),

@@ -26,6 +26,8 @@ try:
 except ImportError:  # Windows: each worker makes what it needs
     fcntl = None
 
+# The table of `-m stability`.
+pytest_plugins = ["tests.stability_table"]
 # Scripts without doctests, which import much.
 collect_ignore = ["benchmarks"]
 SEED = 20060905  # one seed for all; change it with --seed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reflfield.capture import conversion, inspect, readers
+from reflfield.capture import inspect, readers
 from reflfield.capture.capture import Capture
 from reflfield.capture.encoding import parse_encoding
 from reflfield.capture.image_files import ImageReading
@@ -65,54 +65,3 @@ def open_capture(
 def describe_capture(capture: Capture) -> list[str]:
     """Return lines on what a capture holds; some of its photographs are read."""
     return inspect.describe(capture).lines()
-
-
-def convert_capture(
-    capture: Capture, out: Path | str, to: str = "native", *, link: bool = False
-) -> list[Path]:
-    """Write a capture in another format, its photographs copied.
-
-    Parameters
-    ----------
-    capture : Capture
-        Its photographs exist.
-    out : Path or str
-        A folder that is new or empty.
-    to : {"native", "transforms", "colmap"}
-        ``capture.json``, ``transforms.json``, or a COLMAP model with ``lights.csv``.
-    link : bool
-        Hard links in place of copies, where the file system has them.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    InputError
-        If the folder is not empty, or the format cannot say what the capture does.
-    """
-    return conversion.convert_capture(capture, out, to, link=link)
-
-
-def convert_btf(path: Path | str, out: Path | str) -> int:
-    """Write a ``.btf`` container as a capture of a flat sample; the number of its images.
-
-    Parameters
-    ----------
-    path : Path or str
-        Of the University of Bonn's formats FMF, DFMF or BDI, with rotations of texels or not.
-    out : Path or str
-        A folder that is new or empty.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    InputError
-        If the folder is not empty, or the container is damaged or not supported.
-    """
-    return conversion.convert_btf(path, out)

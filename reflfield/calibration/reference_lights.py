@@ -154,9 +154,9 @@ def _with_spheres(
 ) -> References:
     step = -(-len(photographs) // MOST_SEARCHED)
     images = [read_kinds(path, reading)[0] @ LUMINANCE for path in photographs[::step]]
-    found = find_circles([i.astype(np.float32) for i in images], references.n_sought)
+    spheres = find_circles([i.astype(np.float32) for i in images], references.n_sought)
     return References(
-        tuple(found),
+        tuple(spheres),
         0,
         references.matt_sphere,
         references.grey_card,

@@ -62,11 +62,11 @@ def read_btf_images(description: Path, *, follow_links: bool = False) -> Capture
     folder = description.parent
     root = folder.parent if folder.name.startswith("tv") else folder
     files = NamedFiles(description, follow_links=follow_links, root=root)
-    found = _images(root, files)
-    angles = np.radians([_angles(path.name) or () for path in found]).reshape(-1, 2, 2)
+    image_paths = _images(root, files)
+    angles = np.radians([_angles(path.name) or () for path in image_paths]).reshape(-1, 2, 2)
     order = np.argsort(angles[:, 1, 0], kind="stable")
     lights, views = (directions_of_angles(angles[order, i]) for i in (0, 1))
-    paths = [found[i] for i in order]
+    paths = [image_paths[i] for i in order]
     size = image_size(paths[0])
     capture = assembled_capture(
         [

@@ -46,7 +46,7 @@ def convert_capture(
         ``capture.json``; ``transforms.json``; or a COLMAP model with ``images``, ``masks``
         and, where lights are known, ``lights.csv``.
     link : bool
-        Whether photographs become hard links to the files they are, where that is possible.
+        Hard links in place of copies of the photographs, where the file system has them.
 
     Returns
     -------

@@ -14,6 +14,7 @@ from reflfield.cli.check_command import check
 from reflfield.cli.field_commands import compare, export, relight, view
 from reflfield.cli.lights_command import lights
 from reflfield.cli.run_commands import demo, run
+from reflfield.cli.tradeoff_commands import plan, tradeoff
 from reflfield.errors import ReflfieldError
 from reflfield.flags import current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
@@ -30,7 +31,10 @@ app = typer.Typer(
     help="Dome photographs to relightable objects.",
 )
 # In the order of --help.
-for command in (demo, run, relight, compare, view, export, inspect, convert, check, lights):
+for command in (
+    *(demo, run, plan, tradeoff, relight, compare, view, export, inspect, convert, check),
+    lights,
+):
     app.command()(command)
 LONGEST_MESSAGE = 1600
 

@@ -61,8 +61,9 @@ def convert(
     layer: LayerOption = None,
 ) -> None:
     """Write a capture, or a .btf, in another format; what that cannot say is refused."""
-    from reflfield.api.captures import convert_btf, convert_capture, open_capture
+    from reflfield.api.captures import open_capture
     from reflfield.capture.btf_means import holds_btf
+    from reflfield.capture.conversion import convert_btf, convert_capture
 
     if to == "native" and holds_btf(capture):
         with working():

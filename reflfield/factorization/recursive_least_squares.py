@@ -22,6 +22,8 @@ from reflfield.factorization.packed_matrices import outer_products, pack, packed
 COVARIANCE_FLOOR = 1e-9
 # What stands for the variance of data that are all zero; its inverse is still in range.
 LEAST_VARIANCE = 1e-200
+# What the prior weighs at least, over all that a column's samples can.
+LEAST_PRIOR = 8 * float(np.finfo(np.float64).eps)
 # Rows solved at once; bounds the memory of the unpacked matrices.
 ROWS_AT_ONCE = 4096
 
@@ -128,7 +130,9 @@ def infer(model: Model, block: Block, gram: Array) -> Posterior:
     residual = block.values - expected[:, None]
     projected = model.basis.T @ weighted(residual, block.weights, model.n_channels)
     precision = unpack((block.weights.T @ gram).astype(np.float64), model.rank)
-    prior = model.noise * np.linalg.pinv(model.prior_covariance, hermitian=True)
+    prior = _resolvable(
+        model.noise * np.linalg.pinv(model.prior_covariance, hermitian=True), model
+    )
     inverse = np.linalg.solve(precision + prior, np.eye(model.rank)[None])
     step = np.einsum("kij,jk->ki", inverse, projected.astype(np.float64))
     residual -= model.basis @ step.T.astype(model.basis.dtype)
@@ -138,6 +142,18 @@ def infer(model: Model, block: Block, gram: Array) -> Posterior:
         squared_residual=squared_residual(residual, block.weights, model.n_channels),
         spread=model.noise * np.einsum("kij,kij->k", precision, inverse),
     )
+
+
+def _resolvable(prior: Array, model: Model) -> Array:
+    """Prior that is not lost when it is added to what samples weigh.
+
+    With less noise than rounding, columns of fewer samples than the rank would have singular
+    equations.
+    """
+    least = LEAST_PRIOR * float(np.square(model.basis, dtype=np.float64).sum())
+    if model.rank and (weakest := float(np.linalg.eigvalsh(prior)[0])) < least:
+        return prior * (least / weakest)
+    return prior
 
 
 def squared_residual(residual: Array, weights: Array, n_channels: int) -> Array:

@@ -68,7 +68,7 @@ class Completion:
         True where less than 2 % was observed (empty ones included); these
         were completed but did not shape basis, mean and noise.
     empty_rows : (n_rows,) bool
-        True where no column was observed; such a row is zero.
+        True where no column was observed; such a row is zero, but for rounding.
     restarts : int
         Column orders tried and abandoned before this fit.
     """

@@ -45,7 +45,7 @@ ITERATIONS, ROUNDS = 15, 3
 # Smoothness of the lobes, relative to what the rows weigh; of the diffuse table.
 LOBE_SMOOTHNESS, DIFFUSE_SMOOTHNESS = 3e-4, 0.02
 # Nodes of neighbouring difference angles are tied more firmly than those of a layer.
-ACROSS_LAYERS = 3.0
+ACROSS_LAYERS = 0.2
 # Least value of the diffuse table, whose mean is 1.
 LEAST_DIFFUSE = 0.02
 # Tie of every node to zero, relative to what a row weighs per node; of a skew, and that of its

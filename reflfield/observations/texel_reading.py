@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
 from reflfield.capture.color_spaces import LUMINANCE_WEIGHTS
-from reflfield.observations.frame_resampling import Nodes, ResamplingOptions, resample, side_for
+from reflfield.observations.frame_resampling import (
+    Nodes,
+    resample,
+)
 from reflfield.observations.image_projection import directions_of, facing_irradiance
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
+    side_for,
+)
 from reflfield.observations.store import (
     LEAST_TEXELS_PER_CHUNK,
     Bools,

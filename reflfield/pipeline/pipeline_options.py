@@ -10,7 +10,9 @@ from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR, CompressionOpt
 from reflfield.geometry.occlusion import VisibilityOptions
 from reflfield.geometry.uv_atlas import LARGEST_TEXTURE, AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
-from reflfield.observations.frame_resampling import ResamplingOptions
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
+)
 from reflfield.render.renderer import RenderOptions
 from reflfield.util.validation import check_ranges
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.field.build import (
-    BaseSurface,
     FittedReflectance,
     Quantisation,
     build_field,
@@ -84,15 +83,9 @@ class FieldMaker:
 
     def build(self, model: ClusteredModel, frames: Floats, step: float) -> ClusteredField:
         """Quantise the model on the base surface into a field."""
-        context, atlas = self.context, results.atlas(self.context)
-        surface = BaseSurface(
-            positions=atlas.positions,
-            faces=atlas.faces,
-            uv=atlas.uv,
-            texel_of_pixel=results.texels(context).texel_of_pixel,
-        )
+        context = self.context
         return build_field(
-            surface,
+            results.base_surface(context),
             self.fitted(model, frames),
             visibility=context.visibility_kind,  # type: ignore[arg-type]
             light_model="known" if context.training.lights_known else "unknown",

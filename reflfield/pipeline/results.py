@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
+from reflfield.field.build import BaseSurface
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.geometry.mesh import Mesh, read_ply
 from reflfield.geometry.texels import TexelTable, texel_table
@@ -28,6 +29,8 @@ T = TypeVar("T")
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+# What the stage "left_out_views" writes.
+LEFT_OUT_ERRORS = "errors.npz"
 # In the folder of the observations: the samples, or the name of the place where they are.
 SAMPLES, ELSEWHERE = RESTARTABLE[0], "samples.location"
 
@@ -100,6 +103,17 @@ def texels(context: Context) -> TexelTable:
     return texel_table(atlas(context))
 
 
+def base_surface(context: Context) -> BaseSurface:
+    """Mesh, atlas and texels of the base surface, as a field holds them."""
+    stored = atlas(context)
+    return BaseSurface(
+        positions=stored.positions,
+        faces=stored.faces,
+        uv=stored.uv,
+        texel_of_pixel=texels(context).texel_of_pixel,
+    )
+
+
 @cached("visibility")
 def view_visible(context: Context) -> Bools:
     """(n_texels, n_views) True where the camera sees the texel."""
@@ -152,6 +166,13 @@ def base_reader(context: Context) -> TexelReader:
         sides=context.grid_sides,
         options=context.options.resampling,
     )
+
+
+def left_out_errors(context: Context) -> dict[str, NDArray[Any]] | None:
+    """Errors on views left out, `errors` by the number of lobes and `nearest`; None without."""
+    if context.stages.record("left_out_views") is None:
+        return None
+    return arrays(context, "left_out_views", LEFT_OUT_ERRORS)
 
 
 @cached("visibility", "observations")

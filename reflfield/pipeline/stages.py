@@ -8,7 +8,7 @@ is skipped when neither has changed, written whole or not at all, and resumed af
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from reflfield.pipeline import (
     held_out_silhouettes,
     hull,
     indirect,
+    left_out_views,
     maps,
     model_selection,
     observations,
@@ -116,11 +117,19 @@ HELD_OUT_SILHOUETTES = Stage(
     after=(HULL,),
     reads=held_out_silhouettes.silhouettes_digests,
 )
+# some texels fitted without some views -> number of lobes; whether the model suits the object
+LEFT_OUT_VIEWS = Stage(
+    "left_out_views",
+    left_out_views.write_left_out_views,
+    after=(OBSERVATIONS,),
+    options=lambda options: (options.compression.half_vector.smoothness, options.seed),
+    wanted=left_out_views.leaves_views_out,
+)
 # what is "auto" in the options -> selected on held-out photographs, by candidate runs
 MODEL_SELECTION = Stage(
     model_selection.STAGE,
     run_candidates,
-    after=(OBSERVATIONS, HELD_OUT_SILHOUETTES),
+    after=(OBSERVATIONS, HELD_OUT_SILHOUETTES, LEFT_OUT_VIEWS),
     options=lambda options: (
         options.indirect,
         options.completion,
@@ -145,7 +154,7 @@ INDIRECT = Stage(
 SURFACE = Stage(
     "surface",
     surface.write_surface,
-    after=(OBSERVATIONS, INDIRECT),
+    after=(OBSERVATIONS, LEFT_OUT_VIEWS, INDIRECT),
     options=lambda options: (options.compression, options.resampling, options.seed),
     wanted=lambda context: context.options.refines_surface,
 )
@@ -207,7 +216,10 @@ RESAMPLING = Stage(
 COMPRESSION = Stage(
     "compression",
     compression.write_compression,
-    after=(OBSERVATIONS, RESAMPLING, INDIRECT, SURFACE_OBSERVATIONS, SURFACE_INDIRECT),
+    after=(
+        *(OBSERVATIONS, LEFT_OUT_VIEWS, RESAMPLING, INDIRECT),
+        *(SURFACE_OBSERVATIONS, SURFACE_INDIRECT),
+    ),
     options=lambda options: (options.compression, options.resampling, options.seed),
     reads=stage_inputs.field_metadata_digest,
 )
@@ -270,6 +282,7 @@ ORDER = (
     VISIBILITY,
     OBSERVATIONS,
     HELD_OUT_SILHOUETTES,
+    LEFT_OUT_VIEWS,
     MODEL_SELECTION,
     INDIRECT,
     SURFACE,
@@ -308,6 +321,7 @@ def run(
     resources: Resources | None = None,
     from_stage: str | None = None,
     until: str = STAGES[-1],
+    reuse: Sequence[Path] = (),
 ) -> Context:
     """Make a reflectance field of a capture, and measure how good it is.
 
@@ -325,6 +339,9 @@ def run(
         This stage and all later ones are computed again even if nothing changed.
     until : str
         Stop after this stage.
+    reuse : sequence of Path
+        Folders of results of other runs: stages that are complete there with the same inputs
+        and options are taken over.
 
     Returns
     -------
@@ -345,7 +362,7 @@ def run(
         options or PipelineOptions(),
         hold_out or HoldOut(),
         resources or Resources(),
-        StageFolder(out / "stages", redo),
+        StageFolder(out / "stages", redo, [StageFolder(folder / "stages") for folder in reuse]),
         digests=FileDigests(out / "stages" / FILES_INDEX),
     )
     check(context)

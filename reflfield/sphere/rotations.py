@@ -115,6 +115,8 @@ def frames_from_normals(normals: ArrayLike, tangent_hints: ArrayLike) -> Array:
     """
     normal = np.asarray(normals, dtype=np.float64)
     hint = np.asarray(tangent_hints, dtype=np.float64)
+    # Times powers of two, exactly, so that squares of hints of any length stay in range.
+    hint = np.ldexp(hint, -np.frexp(np.abs(hint).max(axis=1, keepdims=True))[1])
     tangent = hint - np.sum(hint * normal, axis=1, keepdims=True) * normal
     length = np.linalg.norm(tangent, axis=1)
     # Below this share of its length the hint's direction is mostly rounding.

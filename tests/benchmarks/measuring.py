@@ -166,21 +166,26 @@ class Results:
         """One row, as a mapping from column to value."""
         self.tables[-1]["rows"].append({name: plain(value) for name, value in cells.items()})
 
-    def write(self):
-        """Write NAME.json, and return its path."""
-        folder = Path(os.environ.get(ELSEWHERE, RESULTS))
+    def write(self, folder=None, written_by=None):
+        """Write NAME.json, and return its path.
+
+        By default into the folder of all results, as written by this process's command.
+        """
+        folder = Path(folder or os.environ.get(ELSEWHERE, RESULTS))
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / f"{self.name}.json"
         with replacing(path) as partial:
-            partial.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+            partial.write_text(
+                json.dumps(self.to_dict(written_by), indent=1, allow_nan=False) + "\n"
+            )
         return path
 
-    def to_dict(self):
+    def to_dict(self, written_by=None):
         """The file's content, by `KEYS`."""
         return {
             "name": self.name,
             "title": self.title,
-            "command": command(),
+            "command": written_by or command(),
             "date": datetime.now(UTC).date().isoformat(),
             "commit": self.commit,
             "machine": machine(),

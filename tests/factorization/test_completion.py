@@ -207,25 +207,45 @@ def test_unobserved_values_are_never_used(rng):
 @pytest.mark.stability
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_unit_does_not_matter(rng, scale, dtype):
+def test_unit_does_not_matter(rng, scale, dtype, bounded):
     data = problem("random", rng, n_directions=10, n_columns=100, rank=2)
     measured = data.measured.astype(dtype) * dtype(scale)
     fit = complete(measured, data.observed, rank=2)
     assert fit.basis.dtype == dtype
     completed = reconstructed(fit).astype(np.float64) / scale
-    assert unobserved_error(completed, data) < 0.01
+    bounded.at_most(
+        unobserved_error(completed, data),
+        0.01,
+        case="any unit",
+        quantity="relative error of gaps, 1e-30 to 1e30",
+        source="the noise of the data",
+        dtype=dtype,
+    )
     assert fit.noise / scale == pytest.approx(0.01, rel=0.1)
 
 
 @pytest.mark.stability
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_rank_above_the_true_rank_is_harmless(rng, dtype):
+def test_rank_above_the_true_rank_is_harmless(rng, dtype, bounded):
     data = problem("random", rng, n_directions=14, n_columns=200, rank=2, noise=0.0)
     fit = complete(data.truth.astype(dtype), data.observed, rank=6)
     # Truth is rounded to float32; directions without data must not blow up the gaps.
-    assert unobserved_error(reconstructed(fit), data) < 1e-4
+    about = {"case": "rank above the true rank", "dtype": dtype}
+    bounded.at_most(
+        unobserved_error(reconstructed(fit), data),
+        1e-4,
+        quantity="relative error of gaps without noise",
+        source="eps of the data over the share that is observed, times the rank",
+        **about,
+    )
     gram = fit.basis.T @ fit.basis
-    assert np.abs(gram - np.eye(6)).max() < 64 * np.finfo(dtype).eps
+    bounded.at_most(
+        np.abs(gram - np.eye(6)),
+        64 * np.finfo(dtype).eps,
+        quantity="largest entry of U^T U - 1",
+        source="a QR in the data's precision: 64 eps",
+        **about,
+    )
 
 
 @pytest.mark.stability
@@ -253,16 +273,22 @@ def test_single_row():
 
 
 @pytest.mark.stability
-def test_condition_1e12_keeps_the_large_directions(rng):
+def test_condition_1e12_keeps_the_large_directions(rng, bounded):
     left = np.linalg.qr(rng.standard_normal((80, 3)))[0]
     truth = (left * [1.0, 1e-6, 1e-12]) @ rng.standard_normal((3, 200))
     seen = rng.random(truth.shape) < 0.6
     completed = reconstructed(complete(truth, seen, rank=3, passes=8))
-    assert np.abs(completed - truth).max() < 1e-5 * np.abs(truth).max()
+    bounded.at_most(
+        np.abs(completed - truth).max() / np.abs(truth).max(),
+        1e-5,
+        case="condition 1e12",
+        quantity="largest error over the largest entry",
+        source="ten times the second of the singular values 1, 1e-6, 1e-12",
+    )
 
 
 @pytest.mark.stability
-def test_error_grows_gently_as_less_is_observed(rng):
+def test_error_grows_gently_as_less_is_observed(rng, bounded):
     data = problem("random", rng, n_directions=28, n_columns=600, rank=4)
     shares = np.array([1.0, 0.6, 0.35, 0.2, 0.1])
     draw = rng.random(data.truth.shape)
@@ -270,9 +296,150 @@ def test_error_grows_gently_as_less_is_observed(rng):
     for share in shares:
         fit = complete(data.measured, draw < share, rank=4)
         errors.append(np.sqrt(((reconstructed(fit) - data.truth) ** 2).mean()))
-    # Least squares: error ~ 1 / sqrt(share); a slope of -1 leaves room for the few-entry end.
     slope = np.polyfit(np.log(shares), np.log(errors), 1)[0]
-    assert -1.0 < slope < -0.4
+    assert slope < -0.4
+    bounded.at_least(
+        slope,
+        -1.0,
+        case="less and less observed",
+        quantity="slope of log error against log share, share 1 to .1",
+        source="least squares: -1/2; room for the end of few entries",
+        dtype=np.float32,
+    )
+
+
+# Smaller than the tables of the design, with its targets.
+TARGETS = {
+    "random": ("gaps at random", 2, 0.002),
+    "hemispheric": ("gaps shaped like occlusion", 4, 0.02),
+    "smooth": ("smooth factors under occlusion", 4, 0.30),
+}
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("pattern", TARGETS)
+def test_gaps_are_filled_to_the_targets(rng, pattern, dtype, bounded):
+    case, passes, target = TARGETS[pattern]
+    data = problem(pattern, rng, n_directions=41, n_columns=500, rank=6)
+    fit = complete(data.measured.astype(dtype), data.observed, rank=6, passes=passes)
+    error = unobserved_error(reconstructed(fit), data, at_least=60)
+    if pattern == "random":
+        # Six coefficients and as much for the basis, of 840 and 250 samples with 1 % noise.
+        target = 0.01 * np.sqrt(6 / 840 + 6 / 250) * 1.2
+    bounded.at_most(
+        error,
+        target,
+        case=case,
+        quantity=f"relative error of gaps, {passes} passes",
+        source="target; at random: noise over the root of the samples, and a fifth",
+        dtype=dtype,
+    )
+    # Counting guesses as data, as the paper does, stalls under occlusion.
+    if pattern == "hemispheric" and dtype is np.float32:
+        brand = complete(data.measured, data.observed, rank=6, passes=4, method="brand")
+        bounded.at_most(
+            error / unobserved_error(reconstructed(brand), data, at_least=60),
+            0.1,
+            case=case,
+            quantity="error over that of Brand's update",
+            source="target",
+            dtype=dtype,
+        )
+
+
+@pytest.mark.stability
+def test_every_order_of_columns_comes_down_to_the_noise(rng, bounded):
+    data = problem("hemispheric", rng, n_directions=21, n_columns=300, rank=4)
+    noises = [
+        complete(data.measured, data.observed, rank=4, seed=seed).noise for seed in range(16)
+    ]
+    bounded.at_most(
+        np.max(noises),
+        1.25 * 0.01,
+        case="orders of columns",
+        quantity="noise left by the worst of 16 orders",
+        source="the noise of the data, 1 %, and a quarter: where a fit is started again",
+        dtype=np.float32,
+    )
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_columns_and_rows_without_data_leave_no_trace(rng, dtype, bounded):
+    data = problem("random", rng, n_directions=18, n_columns=200, rank=3)
+    measured, observed = data.measured.astype(dtype), data.observed.copy()
+    observed[:, :5] = False
+    observed[7] = False
+    observed[:, 5:10] = False
+    observed[:3, 5:10] = True  # one per cent
+    measured[:3, 5:10] = 1e4  # what a broken column may hold
+    fit = complete(measured, observed, rank=3)
+    rest = complete(measured[:, 10:], observed[:, 10:], rank=3)
+    assert np.flatnonzero(fit.empty_rows).tolist() == [7]
+    assert fit.sparse_columns[:10].all()
+    bounded.at_most(
+        np.abs(reconstructed(fit)[:, :5] - fit.mean[:, None]).max(),
+        0.0,
+        case="a column with nothing observed",
+        quantity="departure from the mean column",
+        source="the prior's mean is all that is known",
+        dtype=dtype,
+    )
+    rows = np.arange(len(measured)) != 7
+    bounded.at_most(
+        np.abs(np.linalg.svd(fit.basis[rows].T @ rest.basis[rows], compute_uv=False) - 1).max(),
+        1e-4,
+        case="columns under two percent observed",
+        quantity="1 - cosine of the subspace with and without them",
+        source="they shape nothing; columns come in another order: noise squared",
+        dtype=dtype,
+    )
+    bounded.at_most(
+        abs(fit.noise / rest.noise - 1),
+        0.01,
+        case="columns under two percent observed",
+        quantity="relative change of the noise",
+        source="they shape nothing; columns come in another order",
+        dtype=dtype,
+    )
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_values_where_nothing_was_observed_change_no_byte(rng, dtype, bounded):
+    data = problem("random", rng, n_directions=10, n_columns=80, rank=2)
+    largest = np.finfo(dtype).max
+    rubbish = rng.choice([np.nan, np.inf, -np.inf, largest], size=data.truth.shape)
+    spoiled = np.where(data.observed, data.measured, rubbish).astype(dtype)
+    clean = complete(data.measured.astype(dtype), data.observed, rank=2)
+    dirty = complete(spoiled, data.observed, rank=2)
+    bounded.at_most(
+        np.abs(reconstructed(clean) - reconstructed(dirty)),
+        0.0,
+        case="values where nothing was observed",
+        quantity="change by NaN, infinity and the largest number there",
+        source="they are not read",
+        dtype=dtype,
+    )
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_three_channels_with_one_weight_are_three_rows(rng, dtype, rounding, bounded):
+    truth = rng.standard_normal((120, 2)) @ rng.standard_normal((2, 90))
+    observed = rng.random((40, 90)) < 0.6
+    measured = (truth + 0.01 * rng.standard_normal(truth.shape)).astype(dtype)
+    joint = complete(measured, observed, rank=2, n_channels=3, seed=4)
+    apart = complete(measured, np.repeat(observed, 3, axis=0), rank=2, seed=4)
+    bounded.at_most(
+        np.abs(reconstructed(joint) - reconstructed(apart)),
+        0.01,
+        case="channels that share their gaps",
+        quantity="difference to rows of their own",
+        source="another draw of rows to start from: less than the noise",
+        dtype=dtype,
+    )
 
 
 # --- refused -----------------------------------------------------------------------------

@@ -119,11 +119,57 @@ def test_unit_does_not_matter(rng, scale):
     ],
     ids=["zero", "equal", "three distinct", "one column", "one row"],
 )
-def test_degenerate_columns_are_reproduced(columns):
-    fit = LocalPCA(n_clusters=5, n_components=4).fit(columns)
-    np.testing.assert_allclose(reconstructed(fit), columns, atol=1e-5)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_degenerate_columns_are_reproduced(columns, dtype, bounded):
+    fit = LocalPCA(n_clusters=5, n_components=4).fit(columns.astype(dtype))
+    bounded.at_most(
+        np.abs(reconstructed(fit) - columns),
+        9 * 8 * np.finfo(dtype).eps,
+        case="degenerate columns",
+        quantity="largest error",
+        source="8 roundings of numbers up to 9",
+        dtype=dtype,
+    )
     assert fit.labels.min() >= 0
     assert fit.labels.max() < fit.n_clusters
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_distances_of_columns_far_from_zero(rng, dtype, bounded):
+    """The mean of all columns is a thousand times what they vary by."""
+    columns, _ = clustered_subspaces(rng, n_columns=400, n_clusters=4)
+    plain = LocalPCA(4, 3).fit(columns.astype(dtype))
+    far = (columns.astype(np.float64) + 1e3 * rng.uniform(1, 2, (len(columns), 1))).astype(
+        dtype
+    )
+    fit = LocalPCA(4, 3).fit(far)
+    error = np.sqrt(np.mean((reconstructed(fit).astype(np.float64) - far) ** 2))
+    alone = np.sqrt(np.mean((reconstructed(plain).astype(np.float64) - columns) ** 2))
+    bounded.at_most(
+        error / alone,
+        1.1 if dtype is np.float64 else 1.1 + 4e3 * np.finfo(dtype).eps / alone,
+        case="distances from an expanded square",
+        quantity="error over that without the common mean",
+        source="columns are centred first; in float32 a few roundings of the mean besides",
+        dtype=dtype,
+    )
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_clusters_that_run_empty_are_filled_again(rng, dtype, bounded):
+    """Three distinct columns for eight clusters: seeds that fall together leave five empty."""
+    columns = np.repeat(rng.standard_normal((20, 3)), 40, axis=1)
+    fit = LocalPCA(8, 1).fit(columns.astype(dtype))
+    bounded.at_least(
+        np.bincount(fit.labels, minlength=8).min(),
+        1,
+        case="empty clusters",
+        quantity="columns of the smallest of 8 clusters, 3 distinct columns",
+        source="empty clusters take the worst reconstructed columns",
+        dtype=dtype,
+    )
 
 
 def test_empty_clusters_take_the_worst_points():

@@ -118,13 +118,20 @@ def hard_matrix(name, rng):
         "1e-30", "1e30", "condition 1e12", "single row", "growing",
     ],
 )  # fmt: skip
-def test_basis_stays_orthonormal(rng, name, dtype):
+def test_basis_stays_orthonormal(rng, name, dtype, bounded):
     matrix = hard_matrix(name, rng)
     svd = fed(matrix, 10, 50, dtype=dtype)
     assert svd.basis.dtype == dtype
     assert svd.basis.shape[1] <= min(10, *matrix.shape)
     if svd.basis.size:
-        assert departure(svd.basis) < LIMIT[dtype]
+        bounded.at_most(
+            departure(svd.basis),
+            LIMIT[dtype],
+            case="degenerate blocks",
+            quantity="largest entry of U^T U - 1",
+            source="target",
+            dtype=dtype,
+        )
     values = np.zeros(len(svd.singular_values))
     singular = np.linalg.svd(matrix.astype(np.float64), compute_uv=False)[: len(values)]
     values[: len(singular)] = singular
@@ -153,12 +160,19 @@ def test_columns_inside_the_basis_add_no_direction(rng, dtype, floor):
 
 @pytest.mark.stability
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_orthogonality_after_many_blocks(rng, dtype):
+def test_orthogonality_after_many_blocks(rng, dtype, bounded):
     left = rng.standard_normal((300, 5))
     svd = OnlineSVD(12, dtype)
-    for _ in range(60):
+    for _ in range(157):
         svd.update(left @ rng.standard_normal((5, 64)))
-    assert departure(svd.basis) < LIMIT[dtype]
+    bounded.at_most(
+        departure(svd.basis),
+        LIMIT[dtype],
+        case="exactly low rank, ten thousand columns",
+        quantity="largest entry of U^T U - 1",
+        source="target",
+        dtype=dtype,
+    )
     assert svd.singular_values[4] > 1.0
     assert (svd.singular_values[5:] < LIMIT[dtype] * svd.singular_values[0]).all()
 

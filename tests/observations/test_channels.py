@@ -7,9 +7,15 @@ import pytest
 
 from reflfield.capture.lights import Light
 from reflfield.observations import frame_resampling
-from reflfield.observations.frame_resampling import CONTINUED, ResamplingOptions, resample
+from reflfield.observations.frame_resampling import (
+    CONTINUED,
+    resample,
+)
 from reflfield.observations.image_projection import directions_of
 from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
+)
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.observations.texel_reading import (
     LUMINANCE,

@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 from reflfield.errors import ShapeError
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.frame_refinement import _add_texel, _gains, _own_function, refined_frames
-from reflfield.observations.frame_resampling import ResamplingOptions
 from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
+)
 from reflfield.observations.store import (
     ObservationStore,
     Observed,

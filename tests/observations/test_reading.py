@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from reflfield.capture.lights import Light
-from reflfield.observations.frame_resampling import ResamplingOptions
 from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
+)
 from reflfield.observations.store import ObservationStore, Observed, note_gaps
 from reflfield.observations.texel_reading import NodeColumns, TexelReader, grid_sides
 from reflfield.observations.texel_samples import transform

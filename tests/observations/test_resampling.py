@@ -8,10 +8,12 @@ import pytest
 from reflfield.errors import InputError
 from reflfield.observations import frame_resampling
 from reflfield.observations.frame_resampling import (
-    ResamplingOptions,
     apply_both,
     prior_covariance,
     resample,
+)
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
 )
 from reflfield.observations.texel_samples import (
     POWERS,

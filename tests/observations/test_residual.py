@@ -7,9 +7,11 @@ from reflfield.capture.encoding import encode_srgb
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.metrics.sample_residual import sample_error
-from reflfield.observations.frame_resampling import ResamplingOptions
 from reflfield.observations.image_projection import directions_of
 from reflfield.observations.photographed_pairs import PhotographedPairs
+from reflfield.observations.resampling_options import (
+    ResamplingOptions,
+)
 from reflfield.observations.store import (
     ObservationStore,
     Observed,

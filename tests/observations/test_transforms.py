@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reflfield.observations.frame_resampling import (
+from reflfield.observations.resampling_options import (
     side_for,
 )
 from reflfield.observations.texel_samples import (
