@@ -32,6 +32,7 @@ PACKAGES = (
     "pipeline",
     "api",
     "demo",
+    "reproduction",
     "flags",
     "cli",
     "__main__",

@@ -13,6 +13,7 @@ from reflfield.cli.capture_commands import convert, inspect
 from reflfield.cli.check_command import check
 from reflfield.cli.field_commands import compare, export, relight, view
 from reflfield.cli.lights_command import lights
+from reflfield.cli.reproduce_command import reproduce
 from reflfield.cli.run_commands import demo, run
 from reflfield.errors import ReflfieldError
 from reflfield.flags import current_flags, with_flags
@@ -30,7 +31,19 @@ app = typer.Typer(
     help="Dome photographs to relightable objects.",
 )
 # In the order of --help.
-for command in (demo, run, relight, compare, view, export, inspect, convert, check, lights):
+for command in (
+    demo,
+    run,
+    relight,
+    compare,
+    view,
+    export,
+    inspect,
+    convert,
+    check,
+    lights,
+    reproduce,
+):
     app.command()(command)
 LONGEST_MESSAGE = 1600
 
