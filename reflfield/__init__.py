@@ -45,6 +45,7 @@ if _TYPE_CHECKING:
     from reflfield.api.fields import Field, open_field
     from reflfield.api.images import compare, relight, render_turntable
     from reflfield.api.reconstruction import Result, read_options, reconstruct
+    from reflfield.api.tradeoffs import measure_tradeoff, options_within, plan
     from reflfield.capture.cameras import Camera
     from reflfield.capture.capture import Capture
     from reflfield.capture.conversion import convert_btf, convert_capture
@@ -123,8 +124,11 @@ __all__ = [
     "convert_capture",
     "describe_capture",
     "example_field",
+    "measure_tradeoff",
     "open_capture",
     "open_field",
+    "options_within",
+    "plan",
     "read_options",
     "reconstruct",
     "relight",
@@ -141,6 +145,7 @@ _MODULES = {
     "reflfield.api.fields": ("Field", "open_field"),
     "reflfield.api.images": ("compare", "relight", "render_turntable"),
     "reflfield.api.reconstruction": ("Result", "read_options", "reconstruct"),
+    "reflfield.api.tradeoffs": ("measure_tradeoff", "options_within", "plan"),
     "reflfield.capture.cameras": ("Camera",),
     "reflfield.capture.capture": ("Capture",),
     "reflfield.capture.lights": ("DirectionalLight", "Light", "PointLight"),

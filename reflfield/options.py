@@ -336,6 +336,32 @@ def parse_bytes(text: str, name: str = "max_memory") -> int:
         ) from None
 
 
+_SECONDS = {"": 1, "s": 1, "min": 60, "h": 3600}
+
+
+def parse_seconds(text: str, name: str = "budget") -> float:
+    """Seconds of a duration such as ``90s``, ``20min`` or ``1.5h``.
+
+    Raises
+    ------
+    InputError
+        If the text has another form, or is not above zero.
+
+    Examples
+    --------
+    >>> parse_seconds("20min"), parse_seconds("90")
+    (1200.0, 90.0)
+    """
+    match = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,6})?) ?(s|min|h|)", text.strip())
+    seconds = float(match[1]) * _SECONDS[match[2]] if match else 0.0
+    if not seconds > 0:
+        raise InputError(
+            f"{name}: expected a time above 0 such as 90s, 20min or 1.5h, "
+            f"received {_shown(text)}"
+        )
+    return seconds
+
+
 HOLD_OUT_FORMS = "views=K,lights=K, or photographs=K, or test, or views=K,light-cone=DEGREESdeg"
 
 

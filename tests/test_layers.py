@@ -30,6 +30,7 @@ PACKAGES = (
     "report",
     "checking",
     "pipeline",
+    "tradeoff",
     "api",
     "demo",
     "reproduction",

@@ -66,6 +66,7 @@ PROMISED = {
 # Modules that are started as processes, or copied for other software, and not imported.
 PROCESSES = {
     *("reflfield.__main__", "capture_sim.__main__", "reflfield.geometry.xatlas_worker"),
+    "reflfield.tradeoff.measured_run",
     "reflfield.export.blender_scene.build_object",
     *(f"reflfield.export.mitsuba_scene.{name}" for name in ("reflfield_bsdf", "render")),
 }

@@ -15,6 +15,7 @@ from reflfield.cli.field_commands import compare, export, relight, view
 from reflfield.cli.lights_command import lights
 from reflfield.cli.reproduce_command import reproduce
 from reflfield.cli.run_commands import demo, run
+from reflfield.cli.tradeoff_commands import plan, tradeoff
 from reflfield.errors import ReflfieldError
 from reflfield.flags import current_flags, with_flags
 from reflfield.util.interrupts import ending_on_signals
@@ -32,15 +33,7 @@ app = typer.Typer(
 )
 # In the order of --help.
 for command in (
-    demo,
-    run,
-    relight,
-    compare,
-    view,
-    export,
-    inspect,
-    convert,
-    check,
+    *(demo, run, plan, tradeoff, relight, compare, view, export, inspect, convert, check),
     lights,
     reproduce,
 ):

@@ -60,6 +60,25 @@ def run(
             help="Of the field; the smallest that is as good. Status 3 if none is.",
         ),
     ] = None,
+    preset: Annotated[
+        str,
+        typer.Option(
+            metavar="preview|standard|best",
+            help="Options from measured fronts; --config and --set change them.",
+        ),
+    ] = "standard",
+    budget: Annotated[
+        str,
+        typer.Option(
+            metavar="5min", help="The best preset that is expected to end in this time."
+        ),
+    ] = "",
+    tradeoff: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Of a tradeoff of the capture: --budget takes from it."
+        ),
+    ] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Compute again from here.")
     ] = None,
@@ -88,7 +107,7 @@ def run(
     from reflfield.options import parse_hold_out, size_settings
 
     started = time.perf_counter()
-    options = read_options(config, [*(set_ or []), *size_settings(size, psnr)])
+    options = read_options(config, [*(set_ or []), *size_settings(size, psnr)], preset)
     resources = limits(workers, max_memory, scheduler, store)
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own
@@ -102,5 +121,19 @@ def run(
     )
     asked: dict[str, Any] = {"options": options, "hold_out": held, "resources": resources}
     with working(GOES_ON):
+        asked["options"] = _within(budget, tradeoff, photographed, asked)
         result = reconstruct(photographed, out, **asked, from_stage=from_, until=until)
     say_results(result, started)
+
+
+def _within(budget: str, tradeoff: Path | None, capture: Any, asked: dict[str, Any]) -> Any:
+    """Options that end within a time, or those that were asked for without one."""
+    from reflfield.api.tradeoffs import options_within
+    from reflfield.errors import InputError
+    from reflfield.options import parse_seconds
+
+    if not budget:
+        if tradeoff is not None:
+            raise InputError("tradeoff: expected with a budget, received none; add --budget")
+        return asked["options"]
+    return options_within(parse_seconds(budget), capture, **asked, measured=tradeoff)

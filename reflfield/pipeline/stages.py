@@ -8,7 +8,7 @@ is skipped when neither has changed, written whole or not at all, and resumed af
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -307,6 +307,7 @@ def run(
     resources: Resources | None = None,
     from_stage: str | None = None,
     until: str = STAGES[-1],
+    reuse: Sequence[Path] = (),
 ) -> Context:
     """Make a reflectance field of a capture, and measure how good it is.
 
@@ -324,6 +325,9 @@ def run(
         This stage and all later ones are computed again even if nothing changed.
     until : str
         Stop after this stage.
+    reuse : sequence of Path
+        Folders of results of other runs: stages that are complete there with the same inputs
+        and options are taken over.
 
     Returns
     -------
@@ -344,7 +348,7 @@ def run(
         options or PipelineOptions(),
         hold_out or HoldOut(),
         resources or Resources(),
-        StageFolder(out / "stages", redo),
+        StageFolder(out / "stages", redo, [StageFolder(folder / "stages") for folder in reuse]),
         digests=FileDigests(out / "stages" / FILES_INDEX),
     )
     check(context)

@@ -7,7 +7,8 @@ bytes wherever they are drawn.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -91,6 +92,94 @@ def lines(
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
     return _drawn(draw, x_label, y_label, has_legend=len(series) > 1)
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A point of a plot that has a name.
+
+    Attributes
+    ----------
+    x, y : float
+    label : str
+    y_error : float
+        Half the length of the bar through the point; none if 0.
+    is_ringed : bool
+        True for the point that others are compared with.
+    """
+
+    x: float
+    y: float
+    label: str = ""
+    y_error: float = 0.0
+    is_ringed: bool = False
+
+
+def marked_curves(
+    series: Mapping[str, Sequence[Mark]],
+    x_label: str,
+    y_label: str,
+    *,
+    log_x: bool = False,
+    joined: Collection[str] = (),
+) -> Picture:
+    """Points with names and error bars; of some series, joined by lines.
+
+    Parameters
+    ----------
+    series : mapping of name to sequence of Mark
+        Points that are not finite (or not positive on a logarithmic axis) are left out.
+    x_label, y_label : str
+    log_x : bool
+        True for a logarithmic axis.
+    joined : collection of str
+        Names of series whose points are joined in their order.
+
+    Returns
+    -------
+    Picture
+
+    Examples
+    --------
+    >>> marks = [Mark(1.0, 20.0, "96"), Mark(2.0, 21.0, "192", is_ringed=True)]
+    >>> marked_curves({"hull": marks}, "CPU time, s", "PSNR, dB").media_type
+    'image/svg+xml'
+    """
+
+    def draw(axes: Any) -> None:
+        for colour, (name, marks) in zip(_cycle(len(series)), series.items(), strict=True):
+            shown = [
+                m for m in marks if _plottable([m.x], [m.y], log_x=log_x, log_y=False).size
+            ]
+            x, y = [mark.x for mark in shown], [mark.y for mark in shown]
+            errors = [mark.y_error for mark in shown]
+            line = "-" if name in joined else ""
+            axes.plot(x, y, line, color=colour, label=name, marker="o", markersize=3.5)
+            axes.errorbar(x, y, errors, fmt="none", ecolor=colour, elinewidth=0.8, alpha=0.5)
+            _name_points(axes, shown, colour)
+        _scale(axes, "x", log_x)
+        axes.margins(0.12, 0.15)
+
+    return _drawn(draw, x_label, y_label, has_legend=len(series) > 1)
+
+
+def _name_points(axes: Any, marks: Sequence[Mark], colour: str) -> None:
+    for mark in marks:
+        if mark.is_ringed:
+            axes.plot(
+                *([mark.x], [mark.y]),
+                *("o",),
+                markersize=10,
+                markerfacecolor="none",
+                markeredgecolor=colour,
+            )
+        axes.annotate(
+            _plain(mark.label),
+            (mark.x, mark.y),
+            xytext=(5, 5),
+            textcoords="offset points",
+            fontsize=8,
+        )
 
 
 def histogram(

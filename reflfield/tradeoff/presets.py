@@ -1,0 +1,136 @@
+"""Presets: sets of options from measured fronts, and the best of them within a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from reflfield.capture.capture import Capture
+from reflfield.errors import InputError
+from reflfield.options import HoldOut, Resources, with_tables
+from reflfield.pipeline import stages
+from reflfield.pipeline.pipeline_options import PipelineOptions
+from reflfield.report.page import format_seconds
+from reflfield.tradeoff.machine_speed import machine_seconds, slowness
+from reflfield.tradeoff.run_plan import RunPlan, plan_of
+from reflfield.tradeoff.stage_costs import UnitCosts, shipped_costs
+from reflfield.tradeoff.swept_options import Value, nested
+from reflfield.tradeoff.work_counts import counts_of, covered_share, planned_context
+
+Settings = Mapping[str, Value]
+
+PREVIEW, STANDARD, BEST = "preview", "standard", "best"
+# From the fronts of sweeps (`tradeoff/README.md`), by rising time: what does not matter to the
+# model that a run fits changes nothing.
+LADDER: dict[str, Settings] = {
+    PREVIEW: {
+        "hull.resolution": 96,
+        "texture.texels_per_pixel": 0.8,
+        "compression.half_vector.n_lobes": 2,
+        "compression.half_vector.image_steps": 0,
+        "completion.passes": 1,
+        "alignment.iterations": 1,
+        "alignment.refine": False,
+        "compression.fit": "auto",
+    },
+    STANDARD: {},
+    BEST: {"texture.texels_per_pixel": 2.2, "compression.half_vector.image_steps": 4},
+}
+PRESETS = (PREVIEW, STANDARD, BEST)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Options that were chosen for a time.
+
+    Attributes
+    ----------
+    name : str
+        Of the preset, or of the configuration of a sweep.
+    options : PipelineOptions
+    plan : RunPlan
+    """
+
+    name: str
+    options: PipelineOptions
+    plan: RunPlan
+
+    def sentence(self, budget: float) -> str:
+        """What was chosen, and how long it is expected to take."""
+        return (
+            f"budget of {format_seconds(budget)}: {self.name}, expected to take "
+            f"{format_seconds(self.plan.seconds)} on an otherwise idle machine"
+        )
+
+
+def preset_settings(name: str) -> dict[str, Value]:
+    """Settings of a preset, by ``stage.option``.
+
+    Raises
+    ------
+    InputError
+        If there is none of this name.
+
+    Examples
+    --------
+    >>> preset_settings("standard")
+    {}
+    """
+    if name not in PRESETS:
+        raise InputError(f"preset: expected one of {', '.join(PRESETS)}, received {name!r}")
+    return dict(LADDER[name])
+
+
+def choose_within(
+    budget: float,
+    capture: Capture,
+    options: PipelineOptions,
+    ladder: Mapping[str, Settings],
+    *,
+    hold_out: HoldOut | None = None,
+    resources: Resources | None = None,
+    costs: UnitCosts | None = None,
+) -> Choice:
+    """Choose the best configuration that is expected to end within a time.
+
+    Parameters
+    ----------
+    budget : float
+        Seconds.
+    capture : Capture
+    options : PipelineOptions
+        What the configurations change.
+    ladder : mapping of str to settings
+        By rising quality.
+    hold_out : HoldOut, optional
+    resources : Resources, optional
+    costs : UnitCosts, optional
+        Those of the package by default.
+
+    Returns
+    -------
+    Choice
+
+    Raises
+    ------
+    InputError
+        If even the fastest takes longer; the message says how long.
+    """
+    costs = costs or shipped_costs()
+    slower = slowness(machine_seconds(), costs.machine_seconds)
+    share, choices = None, []
+    for name, settings in ladder.items():
+        changed = with_tables(options, nested(settings))
+        context = planned_context(capture, changed, hold_out, resources)
+        stages.check(context)
+        share = covered_share(context.training) if share is None else share
+        plan = plan_of(context, counts_of(context, share), costs, slower)
+        choices.append(Choice(name, changed, plan))
+    for choice in reversed(choices):
+        if choice.plan.seconds <= budget:
+            return choice
+    least = min(choice.plan.seconds for choice in choices)
+    raise InputError(
+        f"budget: expected at least {format_seconds(least)}, which the fastest of "
+        f"{', '.join(ladder)} is expected to take, received {format_seconds(budget)}"
+    )
