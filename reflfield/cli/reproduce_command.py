@@ -40,7 +40,10 @@ def reproduce(
     started = time.perf_counter()
     with working(GOES_ON):
         wanted = reproducing.Reproduction(
-            felt=felt, directions=directions, pixels=pixels, workers=n_workers(workers)
+            felt=felt,
+            n_directions=directions,
+            photograph_side=pixels,
+            workers=n_workers(workers),
         )
         command = reproducing.command_of(out, wanted)
         page = reproducing.reproduce(out, wanted, only or (), command)

@@ -57,10 +57,10 @@ class Reproduction:
         Texels of the synthetic map of Figures 4 to 6; the paper's has 124 x 90.
     texture_width, texture_height : int
         Texels of the BTFs of Figures 7 and 8 on 151 x 151 directions.
-    directions : int
+    n_directions : int
         Cameras, and lamps, of the object of Figures 9 and 10; 151 is the paper's.
-    pixels : int
-        Side of the object's photographs.
+    photograph_side : int
+        Pixels of the side of the object's photographs.
     workers : int
         Threads.
     """
@@ -70,15 +70,15 @@ class Reproduction:
     map_height: int = 90
     texture_width: int = 32
     texture_height: int = 24
-    directions: int = 32
-    pixels: int = 96
+    n_directions: int = 32
+    photograph_side: int = 96
     workers: int = 1
 
     def __post_init__(self) -> None:
         ranges = {
             "map_width": (4, 512), "map_height": (4, 512),
             "texture_width": (4, 256), "texture_height": (4, 256),
-            "directions": (8, 151), "pixels": (32, 512), "workers": (1, 1024),
+            "n_directions": (8, 151), "photograph_side": (32, 512), "workers": (1, 1024),
         }  # fmt: skip
         for name, (least, most) in ranges.items():
             value = getattr(self, name)
@@ -124,9 +124,11 @@ def _textures(wanted: Reproduction, folder: Path) -> list[Section]:
 
 def _object(wanted: Reproduction, folder: Path) -> list[Section]:
     at = folder / "object"
-    result = object_figures.make_object(at, wanted.directions, wanted.pixels, wanted.workers)
+    result = object_figures.make_object(
+        at, wanted.n_directions, wanted.photograph_side, wanted.workers
+    )
     return [
-        object_figures.figure_9(result, at / "capture", wanted.directions),
+        object_figures.figure_9(result, at / "capture", wanted.n_directions),
         object_figures.figure_10(result.field),
     ]
 
@@ -151,7 +153,7 @@ PARTS = (
         texture_figures.__name__,
         ("felt", "texture_width", "texture_height"),
     ),
-    Part("figures9-10", _object, object_figures.__name__, ("directions", "pixels")),
+    Part("figures9-10", _object, object_figures.__name__, ("n_directions", "photograph_side")),
 )
 NAMES = tuple(part.name for part in PARTS)
 
@@ -260,7 +262,7 @@ def command_of(out: Path, wanted: Reproduction) -> str:
     return shlex.join(words)
 
 
-FLAGS = {"felt": "--felt", "directions": "--directions", "pixels": "--pixels"}
+FLAGS = {"felt": "--felt", "n_directions": "--directions", "photograph_side": "--pixels"}
 
 
 # --- sections as JSON ---------------------------------------------------------------------

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reflfield.cli import main
 from reflfield.errors import InputError
 from reflfield.report.page import Note, Section
 from reflfield.reproduction import correlation_tables, reproduce, texture_figures
@@ -40,10 +41,12 @@ def counted(monkeypatch):
     calls = []
 
     def work(wanted, folder):
-        calls.append(wanted.pixels)
+        calls.append(wanted.photograph_side)
         return [Section("Figure 0", "Nothing.", (Note("A note."),))]
 
-    part = reproduce.Part("figures9-10", work, "reflfield.reproduction.reproduce", ("pixels",))
+    part = reproduce.Part(
+        "figures9-10", work, "reflfield.reproduction.reproduce", ("photograph_side",)
+    )
     monkeypatch.setattr(reproduce, "PARTS", (part,))
     return calls
 
@@ -59,7 +62,7 @@ def test_a_finished_part_is_not_made_again_and_an_option_of_it_makes_it_again(
     reproduce.reproduce(tmp_path, replace(wanted, workers=2))
     assert counted == [96]
     assert page.read_text() == first
-    reproduce.reproduce(tmp_path, replace(wanted, pixels=64))
+    reproduce.reproduce(tmp_path, replace(wanted, photograph_side=64))
     assert counted == [96, 64]
 
 
@@ -74,15 +77,15 @@ def test_a_part_that_is_no_part_is_made_again(content, counted, tmp_path):
 def test_what_cannot_be_used_is_refused(tmp_path):
     with pytest.raises(InputError, match="only: expected parts of table1"):
         reproduce.reproduce(tmp_path, reproduce.Reproduction(), ["table3"])
-    with pytest.raises(InputError, match="directions: expected 8 to 151, received 152"):
-        reproduce.Reproduction(directions=152)
+    with pytest.raises(InputError, match="n_directions: expected 8 to 151, received 152"):
+        reproduce.Reproduction(n_directions=152)
     with pytest.raises(InputError, match=r"xyz_loc.bin: expected the felt's file"):
         reproduce.reproduce(tmp_path, reproduce.Reproduction(felt=tmp_path))
     assert not list(tmp_path.iterdir())
 
 
 def test_the_command_names_what_is_not_the_default(tmp_path):
-    wanted = reproduce.Reproduction(pixels=64, workers=2)
+    wanted = reproduce.Reproduction(photograph_side=64, workers=2)
     line = reproduce.command_of(tmp_path / "a b", wanted)
     assert line == f"reflfield reproduce -o '{tmp_path}/a b' --pixels 64"
 
@@ -92,6 +95,27 @@ def test_sections_come_back_from_json():
     for section in (figure_4(some), figure_5(some), figure_6(some)):
         content = json.loads(json.dumps(reproduce.to_json(section)))
         assert reproduce.from_json(content) == section
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--only", "table3"), "--only: expected parts of table1"),
+        (("--directions", "152"), "--directions: expected 8 to 151, received 152"),
+        (("--pixels", "1"), "--pixels: expected 32 to 512, received 1"),
+        (("--felt", "nowhere"), "nowhere/xyz_loc.bin: expected the felt's file, found none"),
+    ],
+)
+def test_the_command_refuses_with_status_2_and_leaves_nothing(
+    words, message, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    monkeypatch.setattr("sys.argv", ["reflfield", "reproduce", "-o", str(out), *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
 
 
 # --- figures 4 to 8 ----------------------------------------------------------------------
@@ -216,7 +240,7 @@ def test_scenes_of_the_simulator_have_so_many_cameras_and_lamps(directions, tmp_
 
 @pytest.mark.slow
 def test_an_object_is_simulated_processed_and_shown(tmp_path):
-    wanted = reproduce.Reproduction(directions=12, pixels=48)
+    wanted = reproduce.Reproduction(n_directions=12, photograph_side=48)
     page = reproduce.reproduce(tmp_path, wanted, ["figures9-10"])
     text = page.read_text()
     assert "Figure 9: the vase" in text
