@@ -235,7 +235,9 @@ def _is_number(value: Value) -> bool:
 
 
 def _far(usual: Value, value: Value) -> float:
-    """How far a number is from the usual one, as a ratio; of others, how late in their list."""
-    if _is_number(value) and _is_number(usual) and float(value) > 0 and float(usual) > 0:
-        return abs(math.log(float(value) / float(usual)))
-    return 0.0
+    """How far a number is from the usual one, as a ratio; what is no number is near."""
+    if not (_is_number(value) and _is_number(usual)):
+        return 0.0
+    if min(float(value), float(usual)) <= 0:
+        return math.inf
+    return abs(math.log(float(value) / float(usual)))
