@@ -19,7 +19,7 @@ from reflfield.tradeoff.work_counts import WorkCounts
 Value = bool | int | float | str
 # Shares of the views and the lights that make the field: no options of a run.
 VIEWS, LIGHTS = "views", "lights"
-SHARES = (0.25, 0.5, 0.75)
+SHARES = (0.5, 0.25, 0.75)
 # What only changes how a field is shown, not the field.
 SHOWING = ("relighting.samples_per_pixel",)
 DEFAULT_NAME = "default"
@@ -121,9 +121,24 @@ class Configuration:
         >>> Configuration().name
         'default'
         """
-        shares = [(n, getattr(self, n)) for n in (VIEWS, LIGHTS) if getattr(self, n) < 1]
-        words = [f"{name}={shown(value)}" for name, value in self.settings]
-        return ", ".join([*words, *(f"{n}={s:.0%}" for n, s in shares)]) or DEFAULT_NAME
+        return self._named(dict(self.settings))
+
+    @property
+    def short_name(self) -> str:
+        """The differences in words, without the stages of options in groups of their own.
+
+        Examples
+        --------
+        >>> Configuration((("compression.half_vector.n_lobes", 1),)).short_name
+        'half_vector.n_lobes=1'
+        """
+        return self._named({".".join(n.split(".")[-2:]): v for n, v in self.settings})
+
+    def _named(self, settings: Mapping[str, Value]) -> str:
+        shares = {VIEWS: self.views, LIGHTS: self.lights}
+        words = [f"{name}={shown(value)}" for name, value in settings.items()]
+        words += [f"{name}={share:.0%}" for name, share in shares.items() if share < 1]
+        return ", ".join(words) or DEFAULT_NAME
 
     @property
     def folder(self) -> str:
@@ -216,7 +231,8 @@ def one_at_a_time(
     for option in swept:
         usual = value_of(options, option.name)
         others = [value for value in option.values if not same(value, usual)]
-        left[option] = sorted(others, key=partial(_far, usual))
+        is_share = option.name in (VIEWS, LIGHTS)
+        left[option] = others if is_share else sorted(others, key=partial(_far, usual))
     while any(left.values()):
         for option, values in left.items():
             if values:
