@@ -55,14 +55,21 @@ class SweptOption:
         """Whether the option changes anything in a run with such counts."""
         if self.name in (VIEWS, LIGHTS):
             return (counts.n_views if self.name == VIEWS else counts.n_lights) >= 4
-        shaded = counts.shades or self.stage != "indirect"
-        return counts.model in self.models and not (self.solid and counts.is_plane) and shaded
+        needed = {
+            "resampling.view_side": counts.n_views > 1,
+            "resampling.light_side": counts.n_lights > 1,
+            "indirect.enabled": counts.shades,
+            "indirect.n_components": counts.shades,
+        }
+        usable = counts.model in self.models and not (self.solid and counts.is_plane)
+        return usable and needed.get(self.name, True)
 
 
 _HALF, _CLUSTERS = (HALF_VECTOR,), (CLUSTERED,)
 # The first are tried first, where the time does not suffice for all.
 SWEPT = (
     SweptOption("texture.texels_per_pixel", (0.6, 0.8, 1.1, 1.6, 2.2), solid=True),
+    SweptOption("texture.largest", (128, 256, 512, 1024), solid=True),
     SweptOption("compression.half_vector.image_steps", (0, 1, 2, 4), _HALF),
     SweptOption("compression.half_vector.n_lobes", ("auto", 1, 2, 3, 4), _HALF),
     SweptOption("compression.fit", ("auto", "grid", "samples"), _CLUSTERS),
@@ -73,6 +80,8 @@ SWEPT = (
     SweptOption("hull.resolution", (96, 128, 192, 256), solid=True),
     SweptOption("alignment.refine", (False, True), _CLUSTERS),
     SweptOption("alignment.band_limit", (4, 6, 8, 12), _CLUSTERS),
+    SweptOption("resampling.light_side", (0, 5, 7, 9, 11, 13), _CLUSTERS),
+    SweptOption("resampling.view_side", (0, 5, 7, 9, 11, 13), _CLUSTERS),
     SweptOption("completion.passes", (1, 2, 4, 8), _CLUSTERS),
     SweptOption("completion.rank", (6, 12, 24), _CLUSTERS),
     SweptOption("compression.n_components", (3, 6, 12), _CLUSTERS),
