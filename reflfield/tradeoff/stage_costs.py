@@ -309,7 +309,8 @@ def memory_of(stage: str, counts: WorkCounts, options: PipelineOptions) -> dict[
     return held | {
         f"{kind}, memory": 1.0,
         f"{kind}, held samples": counts.n_samples * UNIT,
-        f"{kind}, held pixels": (1 + lobes_of(options)) * pixels * UNIT,
+        # Per pixel and light: values, and derivatives after colours, lobes and rotations.
+        f"{kind}, held pixels": (13 + 3 * lobes_of(options)) * pixels * UNIT,
     }
 
 
