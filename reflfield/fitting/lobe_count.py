@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.fitting.nearest_samples import nearest_samples_error
 from reflfield.fitting.texel_sample_fit import (
     START_WIDTHS,
     SampleBlock,
@@ -80,7 +81,7 @@ def left_out_errors(
     pool: ThreadPoolExecutor,
     smoothness: float,
     seed: int = 0,
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], float]:
     """Weighted root mean square error on views left out, with one lobe, two, and so on.
 
     Parameters
@@ -97,7 +98,9 @@ def left_out_errors(
 
     Returns
     -------
-    (MOST_LOBES,) float64
+    errors : (MOST_LOBES,) float64
+    nearest : float
+        That of the mean of the texels' nearest samples; see `nearest_samples`.
     """
     fitted, measured = of_views(blocks, ~left_out), of_views(blocks, left_out)
     errors = []
@@ -105,7 +108,7 @@ def left_out_errors(
         model = with_start_colors(fitted, start_model(frames, n_lobes), pool)
         model, _ = fit_to_samples(fitted, model, pool, rounds_of(n_lobes), smoothness, seed)
         errors.append(solve_coefficients(measured, model, pool)[1])
-    return np.array(errors)
+    return np.array(errors), nearest_samples_error(fitted, measured, pool)
 
 
 def fewest_lobes(errors: Sequence[float] | NDArray[np.floating]) -> int:

@@ -87,8 +87,6 @@ MOST_PIXELS, MOST_FOOTPRINTS = 32_000_000, 1_500_000
 VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
-# In its record.
-LOBE_ERRORS = "weighted error of views left out, by the number of lobes"
 # Quantisation step of cube roots of samples over that of white, at a relative step of a half.
 STEP = 1 / 64
 
@@ -158,33 +156,25 @@ class HalfVectorFit:
         white = self.white
         return SampleBlocks(lambda n: self._block(parts[n], white), len(parts), budget)
 
-    def lobe_errors(self, folder: Path) -> NDArray[np.float64]:
-        """Errors on views left out with one lobe, two and so on; empty where not measured."""
+    def left_out_errors(self) -> dict[str, NDArray[Any]]:
+        """Errors on views left out: with one lobe, two, and so on, and of nearest samples."""
         context = self.context
-        left_out = views_left_out(context.training.n_views)
-        if self.options.n_lobes != "auto" or not left_out.any():
-            return np.zeros(0)
+        some = self.blocks(results.random_texels(context, LOBE_TEXELS))
+        frames = results.texels(context).local_from_world
+        with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
+            errors, nearest = left_out_errors(
+                *(some, frames, views_left_out(context.training.n_views), pool),
+                *(self.options.smoothness, context.options.seed),
+            )
+        return {"errors": errors, "nearest": np.array(nearest)}
 
-        def measured() -> dict[str, NDArray[Any]]:
-            some = self.blocks(results.random_texels(context, LOBE_TEXELS))
-            frames = results.texels(context).local_from_world
-            with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
-                errors = left_out_errors(
-                    *(some, frames, left_out, pool, self.options.smoothness),
-                    context.options.seed,
-                )
-            return {"errors": errors}
-
-        stored = context.blocks(folder).once("lobes by views left out", measured)
-        return np.asarray(stored["errors"], np.float64)
-
-    def n_lobes(self, folder: Path) -> int:
+    def n_lobes(self) -> int:
         """Lobes that were asked for, or that the views left out ask for."""
         asked = self.options.n_lobes
         if asked != "auto":
             return asked
-        errors = self.lobe_errors(folder)
-        return fewest_lobes(errors) if len(errors) else USUAL_LOBES
+        errors = results.left_out_errors(self.context)
+        return USUAL_LOBES if errors is None else fewest_lobes(errors["errors"])
 
     def to_samples(self, n_lobes: int) -> HalfVectorModel:
         """Model in units of white, fitted to the samples of the texels."""
@@ -401,7 +391,7 @@ def fitted_on_hull(fit: HalfVectorFit, folder: Path) -> ImageFit:
     """Fit from nothing: to the samples, then to the photographs."""
     check_lights(fit.context)
     blocks = fit.context.blocks(folder)
-    n_lobes = fit.n_lobes(folder)
+    n_lobes = fit.n_lobes()
     stored = blocks.once("fit to the samples", lambda: arrays_of(fit.to_samples(n_lobes)))
     return _to_photographs(fit, HalfVectorModel(**stored), folder)
 
@@ -427,12 +417,6 @@ def _to_photographs(fit: HalfVectorFit, model: HalfVectorModel, folder: Path) ->
     information, residual = stored.pop("information"), float(stored.pop("residual"))
     counts = int(stored.pop("n_bounds")), int(stored.pop("n_unmet"))
     return ImageFit(HalfVectorModel(**stored), information, residual, *counts)
-
-
-def lobe_counts(fit: HalfVectorFit, folder: Path) -> dict[str, Any]:
-    """What the number of lobes was found by, for the record of a stage."""
-    errors = fit.lobe_errors(folder)
-    return {LOBE_ERRORS: errors.round(6).tolist()} if len(errors) else {}
 
 
 def stored_half_vector(context: Context) -> HalfVectorModel:
@@ -464,7 +448,6 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
         "share of the pixels fitted to": fit.pixel_share,
-        **(lobe_counts(fit, folder) if on_hull else {}),
         "saturated values, fitted as bounds from below": fitted.n_bounds,
         "of them fitted darker": fitted.n_unmet,
         **made.counts,

@@ -29,6 +29,8 @@ T = TypeVar("T")
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+# What the stage "left_out_views" writes.
+LEFT_OUT_ERRORS = "errors.npz"
 # In the folder of the observations: the samples, or the name of the place where they are.
 SAMPLES, ELSEWHERE = RESTARTABLE[0], "samples.location"
 
@@ -164,6 +166,13 @@ def base_reader(context: Context) -> TexelReader:
         sides=context.grid_sides,
         options=context.options.resampling,
     )
+
+
+def left_out_errors(context: Context) -> dict[str, NDArray[Any]] | None:
+    """Errors on views left out, `errors` by the number of lobes and `nearest`; None without."""
+    if context.stages.record("left_out_views") is None:
+        return None
+    return arrays(context, "left_out_views", LEFT_OUT_ERRORS)
 
 
 @cached("visibility", "observations")

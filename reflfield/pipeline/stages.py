@@ -28,6 +28,7 @@ from reflfield.pipeline import (
     held_out_silhouettes,
     hull,
     indirect,
+    left_out_views,
     maps,
     model_selection,
     observations,
@@ -116,11 +117,19 @@ HELD_OUT_SILHOUETTES = Stage(
     after=(HULL,),
     reads=held_out_silhouettes.silhouettes_digests,
 )
+# some texels fitted without some views -> number of lobes; whether the model suits the object
+LEFT_OUT_VIEWS = Stage(
+    "left_out_views",
+    left_out_views.write_left_out_views,
+    after=(OBSERVATIONS,),
+    options=lambda options: (options.compression.half_vector.smoothness, options.seed),
+    wanted=left_out_views.leaves_views_out,
+)
 # what is "auto" in the options -> selected on held-out photographs, by candidate runs
 MODEL_SELECTION = Stage(
     model_selection.STAGE,
     run_candidates,
-    after=(OBSERVATIONS, HELD_OUT_SILHOUETTES),
+    after=(OBSERVATIONS, HELD_OUT_SILHOUETTES, LEFT_OUT_VIEWS),
     options=lambda options: (
         options.indirect,
         options.completion,
@@ -145,7 +154,7 @@ INDIRECT = Stage(
 SURFACE = Stage(
     "surface",
     surface.write_surface,
-    after=(OBSERVATIONS, INDIRECT),
+    after=(OBSERVATIONS, LEFT_OUT_VIEWS, INDIRECT),
     options=lambda options: (options.compression, options.resampling, options.seed),
     wanted=lambda context: context.options.refines_surface,
 )
@@ -206,7 +215,10 @@ RESAMPLING = Stage(
 COMPRESSION = Stage(
     "compression",
     compression.write_compression,
-    after=(OBSERVATIONS, RESAMPLING, INDIRECT, SURFACE_OBSERVATIONS, SURFACE_INDIRECT),
+    after=(
+        *(OBSERVATIONS, LEFT_OUT_VIEWS, RESAMPLING, INDIRECT),
+        *(SURFACE_OBSERVATIONS, SURFACE_INDIRECT),
+    ),
     options=lambda options: (options.compression, options.resampling, options.seed),
     reads=stage_inputs.field_metadata_digest,
 )
@@ -269,6 +281,7 @@ ORDER = (
     VISIBILITY,
     OBSERVATIONS,
     HELD_OUT_SILHOUETTES,
+    LEFT_OUT_VIEWS,
     MODEL_SELECTION,
     INDIRECT,
     SURFACE,

@@ -27,7 +27,6 @@ from reflfield.pipeline.half_vector_fit import (
     MODEL,
     HalfVectorFit,
     fitted_on_hull,
-    lobe_counts,
     write_model,
 )
 from reflfield.pipeline.indirect import write_indirect
@@ -58,7 +57,6 @@ def write_surface(context: Context, folder: Path) -> dict[str, Any]:
     return {
         "mean displacement": float(np.abs(height).mean()),
         "texels at anchors": int((anchors > 0.5).sum()),
-        **lobe_counts(fit, folder),
     }
 
 

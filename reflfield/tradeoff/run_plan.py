@@ -184,20 +184,14 @@ def plan_of(context: Context, counts: WorkCounts, costs: UnitCosts, slower: floa
 
 def with_planned_selection(context: Context, counts: WorkCounts) -> Context:
     """Return the context with what will be selected in place of "auto"."""
-    options = context.options
-    visibility = options.resampling.visibility
-    return replace(
-        context,
-        options=replace(
-            options,
-            resampling=replace(
-                options.resampling,
-                visibility="factored" if visibility == AUTO else visibility,
-            ),
-            compression=replace(options.compression, model=counts.model),
-        ),
-        asked=options,
+    visibility = context.options.resampling.visibility
+    asked = replace(
+        context.options, compression=replace(context.options.compression, model=counts.model)
     )
+    resampling = replace(
+        asked.resampling, visibility="factored" if visibility == AUTO else visibility
+    )
+    return replace(context, options=replace(asked, resampling=resampling), asked=asked)
 
 
 def wanted_stages(context: Context) -> list[str]:

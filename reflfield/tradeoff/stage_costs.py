@@ -50,6 +50,7 @@ PARALLEL_SHARE = {
     **dict.fromkeys(("silhouettes", "held_out_silhouettes", "comparison"), 0.7),
     **dict.fromkeys(("hull", "observations", "surface_observations", "indirect"), 0.5),
     **dict.fromkeys(("surface_indirect", "error_analysis", "model_selection"), 0.6),
+    "left_out_views": 0.8,
 }
 # Starting the command and importing its libraries, CPU seconds.
 START_SECONDS = 4.0
@@ -75,15 +76,18 @@ def lobes_of(options: PipelineOptions) -> int:
     return USUAL_LOBES if asked == "auto" else int(asked)
 
 
+def _left_out_views(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
+    """Fits of the half-vector model to a few texels with one lobe, two, and so on."""
+    rounds = sum(k * rounds_of(k) for k in range(1, MOST_LOBES + 1))
+    samples = min(counts.n_texels, LOBE_TEXELS) * counts.n_photographs
+    return {"search of lobes": 1.0, "search of lobes, samples": rounds * samples * UNIT}
+
+
 def _hull_fit(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     """Fit of the half-vector model to samples, and to photographs, on the hull."""
     n_photographs, lobes = counts.n_photographs, lobes_of(options)
-    searched = options.compression.half_vector.n_lobes == "auto"
-    rounds = sum(k * rounds_of(k) for k in range(1, MOST_LOBES + 1))
-    few, some = (min(counts.n_texels, n) for n in (LOBE_TEXELS, TRAINING_TEXELS))
+    some = min(counts.n_texels, TRAINING_TEXELS)
     return {
-        "search of lobes": float(searched),
-        "search of lobes, samples": searched * rounds * few * n_photographs * UNIT,
         "tables, rounds": float(lobes * rounds_of(lobes)),
         "tables, samples": lobes * rounds_of(lobes) * some * n_photographs * UNIT,
         "coefficients, samples": lobes * counts.n_samples * UNIT,
@@ -277,6 +281,7 @@ WORK: dict[str, Work] = {
     "visibility": _visibility,
     "observations": _observations,
     "held_out_silhouettes": lambda counts, options: {"compared": 1.0},
+    "left_out_views": _left_out_views,
     "indirect": _indirect,
     "surface": _surface,
     "surface_visibility": _visibility,

@@ -36,7 +36,7 @@ def painted(rng, shares):
 
 def errors_of(block, frames):
     with ThreadPoolExecutor(2) as pool:
-        return left_out_errors(blocks_of(block), frames, LEFT_OUT, pool, 3e-4)
+        return left_out_errors(blocks_of(block), frames, LEFT_OUT, pool, 3e-4)[0]
 
 
 @pytest.mark.parametrize("materials", [1, 2])

@@ -1,0 +1,79 @@
+"""The mean of nearest samples: against sums in NumPy, and where there is nothing to average."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from reflfield.fitting.lobe_count import of_views, views_left_out
+from reflfield.fitting.nearest_samples import LEAST_WEIGHT, WIDTHS, nearest_samples_error
+from reflfield.fitting.robust_weights import HUBER, squared_weight
+from reflfield.fitting.texel_sample_fit import start_model
+from tests.fitting.conftest import frames_about
+from tests.fitting.test_texel_sample_fit import N_VIEWS, block_of, blocks_of
+
+LEFT_OUT = views_left_out(N_VIEWS)
+
+
+@pytest.fixture
+def block(small_rng):
+    block = block_of(small_rng, start_model(frames_about(small_rng, 9), 1))
+    block.values[small_rng.random(len(block.values)) < 0.1] = np.nan
+    return block
+
+
+def parts_of(block):
+    return of_views(blocks_of(block), ~LEFT_OUT), of_views(blocks_of(block), LEFT_OUT)
+
+
+def error_of(fitted, measured):
+    with ThreadPoolExecutor(2) as pool:
+        return nearest_samples_error(fitted, measured, pool)
+
+
+def samples_of(block, texel):
+    """Directions (n, 6) and values (n, 3) of one texel's samples, float64."""
+    own = slice(block.first[texel], block.first[texel + 1])
+    views, lights = block.views[texel, block.view[own]], block.lights[texel, block.light[own]]
+    return np.concatenate([views, lights], axis=1, dtype=np.float64), block.values[own]
+
+
+def test_error_is_that_of_the_weighted_means(block):
+    fitted, measured = parts_of(block)
+    squares = np.zeros((len(WIDTHS), 2))
+    for texel in range(len(block.texels)):
+        known, values = samples_of(fitted[0], texel)
+        asked, truth = samples_of(measured[0], texel)
+        square = np.square(asked[:, None] - known[None]).sum(axis=2)
+        for width, out in zip(WIDTHS, squares, strict=True):
+            weight = np.exp(-square / (2 * width**2)) + LEAST_WEIGHT
+            weight = weight[..., None] * np.isfinite(values)
+            shown = (weight * np.nan_to_num(values)).sum(axis=1) / weight.sum(axis=1)
+            for y, s in zip(truth.ravel(), shown.astype(np.float32).ravel(), strict=True):
+                if np.isfinite(y):
+                    out += squared_weight(y, s, HUBER) * (y - s) ** 2, 1
+    expected = np.sqrt((squares[:, 0] / squares[:, 1]).min())
+    # Weights are float32, of residuals that are rounded to it: some eps of the values.
+    assert error_of(fitted, measured) == pytest.approx(expected, rel=1e-5)
+
+
+def test_samples_that_do_not_vary_are_shown(block):
+    block.values[:] = 0.25
+    assert error_of(*parts_of(block)) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("known", [True, False])
+def test_nothing_to_average_or_to_show_is_no_error(block, known):
+    fitted, measured = parts_of(block)
+    nothing = of_views(blocks_of(block), np.zeros(N_VIEWS, np.bool_))
+    assert error_of(*((fitted, nothing) if known else (nothing, measured))) == 0.0
+
+
+@pytest.mark.stability
+def test_directions_far_from_all_samples_still_have_a_mean(block):
+    """The weights of all samples underflow, so each counts alike."""
+    fitted, measured = parts_of(block)
+    measured[0].views[:] *= 100.0
+    assert np.isfinite(error_of(fitted, measured))
+    assert error_of(fitted, measured) > 0.0
