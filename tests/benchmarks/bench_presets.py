@@ -5,8 +5,8 @@
     python tests/benchmarks/bench_presets.py --presets preview --out RUNS        # some presets
 
 Each capture is processed by the command that a user would type, with each preset, in a process
-of its own; those that are finished in RUNS are not made again. CPU time is that of all stages, and
-of those that make the field, without its measurement, pages and report.
+of its own; those that are finished in RUNS are not made again. CPU time is that of all stages,
+and of those that make the field, without its measurement, pages and report.
 
 Writes results/presets.json. The simulated captures are made in RUNS; the others are test data,
 looked for in REFLFIELD_DATA, by default ../shared/data, and skipped where absent.
