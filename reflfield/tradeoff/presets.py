@@ -123,7 +123,7 @@ def quick_clusters(capture: Capture) -> dict[str, Value]:
     return {**QUICK_FIT, **fewer}
 
 
-def ladder_of(capture: Capture) -> dict[str, Settings]:
+def ladder_of(capture: Capture) -> Mapping[str, Settings]:
     """Settings of all presets for a capture, by rising time."""
     return {name: preset_settings(name, capture) for name in LADDER}
 

@@ -5,7 +5,8 @@
     python tests/benchmarks/bench_presets.py --presets preview --out RUNS        # some presets
 
 Each capture is processed by the command that a user would type, with each preset, in a process
-of its own; those that are finished in RUNS are not made again. CPU time is that of all stages.
+of its own; those that are finished in RUNS are not made again. CPU time is that of all stages,
+and of those that make the field, without its measurement, pages and report.
 
 Writes results/presets.json. The simulated captures are made in RUNS; the others are test data,
 looked for in REFLFIELD_DATA, by default ../shared/data, and skipped where absent.
@@ -26,6 +27,8 @@ from benchmarks.measuring import Results  # noqa: E402
 
 from reflfield.tradeoff.presets import LADDER, PRESETS  # noqa: E402
 
+# Stages after the field is made.
+AFTER = ("maps", "comparison", "error_analysis", "web_page", "report")
 CAPTURES = ("small_vase", "mitsuba_spot", "rti_loewenkopf", "dinoSparseRing")
 
 
@@ -52,6 +55,9 @@ def measured(name, preset, out, workers):
         "unseen, dB": round(means["truth"]["psnr_ldr"], 2) if "truth" in means else None,
         "SSIM": round(means["heldout"]["ssim"], 4),
         "CPU time, s": round(sum(stage[0] for stage in stages.values()), 1),
+        "of the field, s": round(
+            sum(cpu for n, (cpu, *_) in stages.items() if n not in AFTER), 1
+        ),
         "memory, GB": round(max(stage[1] for stage in stages.values()) / 2**30, 2),
         "field, kB": round((folder / "field.rfld").stat().st_size / 1000, 1),
     }
