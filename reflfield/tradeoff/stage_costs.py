@@ -124,10 +124,10 @@ def _compression(counts: WorkCounts, options: PipelineOptions) -> dict[str, floa
 def _clusters(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     """Local PCA on the grid, then the fit to samples where they may be enough."""
     compression = options.compression
-    components = 1 + compression.n_components
+    components = 1 + compression.components
     work = {
-        "clusters": float(compression.n_clusters),
-        "clusters, texels": compression.n_clusters * components * counts.n_texels * UNIT,
+        "clusters": float(compression.clusters),
+        "clusters, texels": compression.clusters * components * counts.n_texels * UNIT,
         "clusters, nodes": components * counts.n_texels * counts.n_nodes * UNIT,
     }
     if compression.fit == "grid":
