@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
-from reflfield.factorization.clustering import Clusters, cluster_columns
+from reflfield.factorization.clustering import Clusters, cluster_columns, nearest
 from reflfield.factorization.column_sources import (
     Columns,
     Reader,
@@ -92,6 +92,9 @@ class LocalPCA:
         Dimension of the space that is iterated in; at least `n_components` is used.
     block : int
         Columns held in memory at once.
+    most_columns : int
+        Columns, drawn at random, that shape the clusters where there are more; the others
+        then join the nearest. Millions of pixels say no more about eight clusters.
 
     Raises
     ------
@@ -126,10 +129,11 @@ class LocalPCA:
     iterations: int = 50
     work_components: int = 96
     block: int = 256
+    most_columns: int = 1 << 17
 
     def __post_init__(self) -> None:
         lowest = {"n_clusters": 1, "n_components": 0, "iterations": 1, "work_components": 1,
-                  "block": 1}  # fmt: skip
+                  "block": 1, "most_columns": 1}  # fmt: skip
         for name, smallest in lowest.items():
             if getattr(self, name) < smallest:
                 raise InputError(
@@ -158,23 +162,28 @@ class LocalPCA:
         reader = reader_of(source, 1, self.block)
         n_dimensions = max(self.work_components, self.n_components)
         space = pca_workspace(reader, n_dimensions, self.block, self.seed)
-        clusters, history = cluster_columns(
-            space.coordinates,
-            min(self.n_clusters, source.shape[1]),
-            self.n_components,
-            self.iterations,
-            np.random.default_rng(self.seed),
-        )
+        clusters, history = self._clusters(space.coordinates)
+        labels = clusters.labels
+        if len(labels) < source.shape[1]:
+            labels = nearest(space.coordinates, clusters)[0]
         means, bases = _lifted(space, clusters)
-        coefficients, squared = _project(reader, means, bases, clusters.labels, self.block)
+        coefficients, squared = _project(reader, means, bases, labels, self.block)
         return ClusteredBasis(
-            labels=clusters.labels,
+            labels=labels,
             means=means * reader.dtype.type(reader.scale),
             bases=bases,
             coefficients=coefficients * reader.dtype.type(reader.scale),
             residual=float(np.sqrt(squared / np.prod(source.shape))) * reader.scale,
             history=history,
         )
+
+    def _clusters(self, points: Array) -> tuple[Clusters, tuple[float, ...]]:
+        """Clusters of the points, of at most `most_columns` drawn at random."""
+        rng = np.random.default_rng(self.seed)
+        if len(points) > self.most_columns:
+            points = points[np.sort(rng.choice(len(points), self.most_columns, replace=False))]
+        n_clusters = min(self.n_clusters, len(points))
+        return cluster_columns(points, n_clusters, self.n_components, self.iterations, rng)
 
 
 def _groups(labels: NDArray[np.integer]) -> Iterator[tuple[int, Columns]]:

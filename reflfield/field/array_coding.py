@@ -9,6 +9,8 @@ noted; the dictionary follows from the size, so that a file cannot ask for memor
 from __future__ import annotations
 
 import lzma
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -23,37 +25,68 @@ SMALLEST_DICTIONARY = 1 << 12
 # "none": as it is. "delta": differences down the rows. "fresh": distance from the first index
 # not used before, 0 for that index itself: small where triangles follow their neighbours.
 FILTERS = ("none", "delta", "fresh")
+# Arrays that are smooth down their rows, whose differences are smaller; those that are not here
+# are packed both ways, and the better one is kept.
+KNOWN_FILTERS = {"faces": "fresh", "texel_of_pixel": "delta", "turns": "none"}
+TRIED_FILTERS = ("none", "delta")
+# Ways are tried on the first rows, of so many bytes, of an array that is larger than this.
+LARGE_BYTES, SAMPLE_BYTES = 2 << 20, 1 << 19
 
 
-def pack(array: NDArray[Any], filter_name: str) -> tuple[bytes, int]:
-    """Bytes of an array, and the context bits that they were packed with.
+@dataclass(frozen=True)
+class PackedArray:
+    """Bytes of an array with what they were packed by."""
+
+    content: bytes
+    filter: str
+    context_bits: int
+
+
+def packed_array(name: str, array: NDArray[Any]) -> PackedArray:
+    """Pack one of a field's arrays, in the better of the ways that are tried for it."""
+    filters = (KNOWN_FILTERS[name],) if name in KNOWN_FILTERS else TRIED_FILTERS
+    if array.dtype.kind == "f" or array.shape[0] < 2:
+        filters = ("none",)
+    if array.nbytes <= LARGE_BYTES:
+        return _best_packed(array, filters, CONTEXT_BITS)
+    # Each way takes a second for a megabyte: they are tried on some of the rows.
+    rows = max(2, len(array) * SAMPLE_BYTES // array.nbytes)
+    best = _best_packed(array[:rows], filters, CONTEXT_BITS)
+    return _best_packed(array, (best.filter,), (best.context_bits,))
+
+
+def _best_packed(
+    array: NDArray[Any], filters: Sequence[str], context_bits: Sequence[int]
+) -> PackedArray:
+    ways = [PackedArray(pack(array, f, n), f, n) for f in filters for n in context_bits]
+    return min(ways, key=lambda packed: len(packed.content))
+
+
+def pack(array: NDArray[Any], filter_name: str, context_bits: int) -> bytes:
+    """Bytes of an array.
 
     Parameters
     ----------
     array : ndarray
         Integers or float32.
     filter_name : {"none", "delta", "fresh"}
+    context_bits : int
+        One of `CONTEXT_BITS`; which packs better depends on the array.
 
     Returns
     -------
-    content : bytes
-    context_bits : int
+    bytes
 
     Examples
     --------
-    >>> content, bits = pack(np.arange(1000, dtype=np.int32), "delta")
+    >>> content = pack(np.arange(1000, dtype=np.int32), "delta", 0)
     >>> len(content) < 60
     True
-    >>> unpack(content, np.dtype("int32"), (1000,), "delta", bits)[-3:]
+    >>> unpack(content, np.dtype("int32"), (1000,), "delta", 0)[-3:]
     array([997, 998, 999], dtype=int32)
     """
     raw = _planes(_filtered(array, filter_name))
-    packed = [
-        lzma.compress(raw, lzma.FORMAT_RAW, filters=_lzma(len(raw), bits))
-        for bits in CONTEXT_BITS
-    ]
-    best = min(range(len(packed)), key=lambda i: len(packed[i]))
-    return packed[best], CONTEXT_BITS[best]
+    return lzma.compress(raw, lzma.FORMAT_RAW, filters=_lzma(len(raw), context_bits))
 
 
 def unpack(

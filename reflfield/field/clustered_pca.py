@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import isqrt
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from reflfield.errors import InputError
-from reflfield.factorization import Completion, LocalPCA
+from reflfield.factorization import ClusteredBasis, Completion, LocalPCA
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.half_vector import HalfVectorOptions
 from reflfield.field.sample_fit import SampleFitOptions
@@ -36,6 +37,8 @@ LEAST_SPREAD = 1e-9
 NEAREST_PAIRS = 8
 
 
+# Clusters and components, usually, and of one view under known lights.
+USUAL_COUNTS, ONE_VIEW_COUNTS = (8, 6), (16, 12)
 # Models of a field.
 CLUSTERED, HALF_VECTOR = "clustered", "half_vector"
 
@@ -53,8 +56,10 @@ class CompressionOptions:
         "half_vector" for a solid object under known lights where a texel has enough samples
         and neither `fit` nor `comparison.without_alignment` asks for the other.
     half_vector : HalfVectorOptions
-    n_clusters, n_components : int
-        Clusters, and basis functions of each beside its mean.
+    n_clusters, n_components : int or "auto"
+        Clusters, and basis functions of each beside its mean. "auto" is 8 and 6, and for one
+        view under known lights, whose normals are those of photometric stereo, 16 and 12: in
+        such frames highlights stand at the angles of the view and vary more.
     fit : {"auto", "samples", "grid"}
         "grid": local PCA of the resampled texels, as in the paper. "samples": from there,
         mean, basis and coefficients are fitted to the samples themselves. "auto" makes
@@ -80,8 +85,8 @@ class CompressionOptions:
 
     model: str = "auto"
     half_vector: HalfVectorOptions = field(default_factory=HalfVectorOptions)
-    n_clusters: int = 8
-    n_components: int = 6
+    n_clusters: int | Literal["auto"] = "auto"
+    n_components: int | Literal["auto"] = "auto"
     fit: str = "auto"
     rank: int = 16
     training_texels: int = 8192
@@ -106,6 +111,8 @@ class CompressionOptions:
             ("training_texels", 1, 1 << 24),
             ("size", 0, 1 << 40),
         ):
+            if name.startswith("n_") and getattr(self, name) == "auto":
+                continue
             if not least <= getattr(self, name) <= most:
                 raise InputError(
                     f"{name}: expected at least {least} and at most {most}, "
@@ -120,13 +127,40 @@ class CompressionOptions:
             )
         check_ranges(self, {"relative_step": (1e-3, 1e3)})
 
+    @property
+    def clusters(self) -> int:
+        """Number of clusters; the usual one where none is stated."""
+        return USUAL_COUNTS[0] if self.n_clusters == "auto" else self.n_clusters
+
+    @property
+    def components(self) -> int:
+        """Number of components; the usual one where none is stated."""
+        return USUAL_COUNTS[1] if self.n_components == "auto" else self.n_components
+
+    def with_counts(self, clusters: int, components: int) -> CompressionOptions:
+        """Options with these counts in place of "auto".
+
+        Examples
+        --------
+        >>> options = CompressionOptions(n_components=4).with_counts(12, 10)
+        >>> options.n_clusters, options.n_components
+        (12, 4)
+        """
+        if "auto" not in (self.n_clusters, self.n_components):
+            return self
+        return replace(
+            self,
+            n_clusters=clusters if self.n_clusters == "auto" else self.n_clusters,
+            n_components=components if self.n_components == "auto" else self.n_components,
+        )
+
     def fits_samples(self, n_samples: float) -> bool:
         """Whether to fit to the samples, of which a texel has `n_samples` on average.
 
         With a few samples a texel, its coefficients would follow their errors; on dense
         domes the grids lose little and the samples of enough texels do not fit in memory.
         """
-        enough = SAMPLES_PER_COEFFICIENT * self.n_components
+        enough = SAMPLES_PER_COEFFICIENT * self.components
         return self.fit == "samples" or (
             self.fit == "auto" and enough <= n_samples <= MOST_SAMPLES
         )
@@ -160,10 +194,26 @@ def cluster_completed(
     ClusteredModel
         With a prior from the spread of each cluster's coefficients.
     """
-    n_components = min(options.n_components, completion.rank)
-    local = LocalPCA(options.n_clusters, n_components, seed=seed).fit(
-        np.ascontiguousarray(coefficients[observed].T)
-    )
+    local = clusters_of(coefficients[observed], options, seed)
+    return lifted_clusters(completion, local, observed, len(coefficients), node_counts)
+
+
+def clusters_of(coefficients: Floats, options: CompressionOptions, seed: int) -> ClusteredBasis:
+    """Clusters of texels by their coefficients (n, rank) in the basis of a completion."""
+    n_components = min(options.components, coefficients.shape[1])
+    local = LocalPCA(options.clusters, n_components, seed=seed)
+    return local.fit(np.ascontiguousarray(coefficients.T))
+
+
+def lifted_clusters(
+    completion: Completion,
+    local: ClusteredBasis,
+    observed: NDArray[np.intp],
+    n_texels: int,
+    node_counts: tuple[int, int],
+) -> ClusteredModel:
+    """Model of clusters of the observed texels; the others get cluster 0 and zeros."""
+    n_components = local.coefficients.shape[1]
     means = completion.mean + local.means @ completion.basis.T
     bases = completion.basis @ local.bases  # (n_clusters, n_rows, K)
     table = np.concatenate([means[:, :, None], bases], axis=2)
@@ -173,8 +223,8 @@ def cluster_completed(
     # Of the coefficients in an orthonormal basis; here per row of the columns.
     left_out = local.residual**2 * completion.rank / len(completion.mean)
     model = ClusteredModel(
-        cluster=np.zeros(len(coefficients), np.int32),
-        coefficients=np.zeros((len(coefficients), n_components), np.float32),
+        cluster=np.zeros(n_texels, np.int32),
+        coefficients=np.zeros((n_texels, n_components), np.float32),
         table=np.ascontiguousarray(table, np.float32),
         precision=_precision(
             local.labels, local.coefficients, completion.noise, local.n_clusters
@@ -184,6 +234,24 @@ def cluster_completed(
     model.cluster[observed] = local.labels
     model.coefficients[observed] = local.coefficients
     return model
+
+
+def completion_model(
+    completion: Completion, node_counts: tuple[int, int], n_texels: int
+) -> ClusteredModel:
+    """Mean and basis of a completion as a model of one cluster, with its prior."""
+    rank, used = completion.rank, completion.coefficients[~completion.sparse_columns]
+    table = np.concatenate([completion.mean[:, None], completion.basis], axis=1)
+    table = table.reshape(1, *node_counts, 3, rank + 1)
+    table = np.swapaxes(table, 3, 4).reshape(1, *node_counts, -1)
+    _fill_empty_nodes(table, completion.empty_rows.reshape(*node_counts, 3)[..., 0])
+    labels = np.zeros(len(used), np.int32)
+    return ClusteredModel(
+        cluster=np.zeros(n_texels, np.int32),
+        coefficients=np.zeros((n_texels, rank), np.float32),
+        table=np.ascontiguousarray(table, np.float32),
+        precision=_precision(labels, used, completion.noise, 1),
+    )
 
 
 def _fill_empty_nodes(table: NDArray[np.floating], empty: NDArray[np.bool_]) -> None:

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import FieldFileError, InputError
-from reflfield.field.array_coding import FILTERS, pack, unpack
+from reflfield.field.array_coding import FILTERS, PackedArray, packed_array, unpack
 from reflfield.field.array_schemas import SCHEMAS, Schema, check_arrays, node_side
 from reflfield.field.half_vector import SKEW_NODES
 from reflfield.field.reflectance_field import (
@@ -62,11 +62,6 @@ MAX_BYTES = 4 << 30
 
 # The oldest date a ZIP archive can hold.
 FIXED_TIME = (1980, 1, 1, 0, 0, 0)
-
-# Arrays that are smooth down their rows, whose differences are smaller; those that are not here
-# are packed both ways, and the better one is kept.
-KNOWN_FILTERS = {"faces": "fresh", "texel_of_pixel": "delta", "turns": "none"}
-TRIED_FILTERS = ("none", "delta")
 
 
 def schema_of(reflectance_field: ReflectanceField) -> Schema:
@@ -235,26 +230,6 @@ class StoredArrays(Mapping[str, NDArray[Any]]):
 def member_name(array: str) -> str:
     """Name of an array's member in the archive."""
     return f"{array}.bin"
-
-
-@dataclass(frozen=True)
-class PackedArray:
-    """Bytes of an array with what they were packed by."""
-
-    content: bytes
-    filter: str
-    context_bits: int
-
-
-def packed_array(name: str, array: NDArray[Any]) -> PackedArray:
-    """Pack one of a field's arrays, in the better of the ways that are tried for it."""
-    filters = (KNOWN_FILTERS[name],) if name in KNOWN_FILTERS else TRIED_FILTERS
-    if array.dtype.kind == "f" or array.shape[0] < 2:
-        filters = ("none",)
-    packed_ways = [
-        PackedArray(content, f, bits) for f in filters for content, bits in [pack(array, f)]
-    ]
-    return min(packed_ways, key=lambda packed: len(packed.content))
 
 
 def _header(reflectance_field: ReflectanceField, members: Mapping[str, PackedArray]) -> bytes:

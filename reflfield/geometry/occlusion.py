@@ -129,10 +129,11 @@ def view_visibility(
     visible = _faces_camera(texels, camera, options)
     visible &= _on_usable_pixel(texels, camera, usable)
     seen = np.flatnonzero(visible)
-    starts = lifted_positions(texels.subset(seen), scene, options)
-    visible[seen] = ~scene.occluded(
-        starts, camera.view_directions(starts), _camera_distances(camera, starts)
-    )
+    if not _is_flat(scene):
+        starts = lifted_positions(texels.subset(seen), scene, options)
+        visible[seen] = ~scene.occluded(
+            starts, camera.view_directions(starts), _camera_distances(camera, starts)
+        )
     return visible
 
 
@@ -204,10 +205,17 @@ def light_visibility(
     if light.kind in _WITHOUT_DIRECTION:
         return np.ones(len(texels), dtype=bool)
     lit = _faces_light(texels, light, options)
+    if _is_flat(scene):
+        return lit
     rows = np.flatnonzero(lit)
     starts = lifted_positions(texels.subset(rows), scene, options)
     lit[rows] = ~scene.occluded(starts, light.directions(starts), light.distances(starts))
     return lit
+
+
+def _is_flat(scene: RayScene) -> bool:
+    """Whether the mesh lies in a plane z = constant, no point of which hides another."""
+    return bool(np.ptp(scene.mesh.vertices[:, 2]) == 0.0)
 
 
 def check_light_outside(scene: RayScene, light: Light) -> None:

@@ -14,8 +14,9 @@ from reflfield.alignment.align_texels import checked_options, frames_of
 from reflfield.alignment.alignment_model import AlignmentModel
 from reflfield.alignment.model_arrays import arrays_of_model, model_of_arrays
 from reflfield.alignment.model_fit import FitOptions, fit_model
+from reflfield.alignment.photometric_normals import frames_towards, photometric_normals
 from reflfield.alignment.sample_sources import GriddedSamples, ScatteredSource
-from reflfield.observations.texel_reading import LUMINANCE, TexelReader
+from reflfield.observations.texel_reading import LUMINANCE, TexelReader, luminance_of
 from reflfield.observations.texel_samples import inverse_transform
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
@@ -30,6 +31,8 @@ Indices = NDArray[np.intp]
 REFINEMENT = RefinementOptions(
     side=25, rounds=4, texels_per_cluster=8192, samples_per_pair=64.0
 )
+# Texels whose normals are found together.
+TEXELS_AT_ONCE = 4096
 ENTRIES = ("local_from_base", "cluster", "score", "margin")
 
 
@@ -61,7 +64,8 @@ def write_alignment(context: Context, folder: Path) -> dict[str, Any]:
     }
     keep = np.zeros(len(results.measured_texels(context)), bool)
     if context.options.alignment.enabled and max(context.grid_sides) > 1:
-        entries = aligned(context, context.blocks(folder))
+        align = photometric if context.photometric else aligned
+        entries = align(context, context.blocks(folder))
         seen = results.measured_texels(context)
         keep = entries["margin"] >= context.options.alignment.least_margin
         arrays["aligned"][seen[keep]] = True
@@ -108,6 +112,40 @@ def aligned(context: Context, blocks: Blocks) -> dict[str, NDArray[Any]]:
     shared = Aligning(model_of_arrays(model), gridded, raw)
     parts = blocks.map("frames of all texels", aligned_block, shared, rows)
     return {name: parts.joined(name) for name in ENTRIES} | {"history": model["history"]}
+
+
+def photometric(context: Context, blocks: Blocks) -> dict[str, NDArray[Any]]:
+    """Frames of the texels of one view, from their normals by photometric stereo."""
+    reader = results.base_reader(context)
+    texels = results.measured_texels(context)
+    parts = blocks.map("normals of all texels", normals_block, reader, reader.blocks_of(texels))
+    entries = {name: parts.joined(name) for name in ENTRIES}
+    return entries | {"history": np.zeros(0)}
+
+
+def normals_block(reader: TexelReader, texels: Indices) -> dict[str, NDArray[Any]]:
+    """Frames of some texels from their normals, the view in the plane of x and z."""
+    base = reader.local_from_world[texels]
+    parts = []
+    for first in range(0, len(texels), TEXELS_AT_ONCE):
+        some = texels[first : first + TEXELS_AT_ONCE]
+        samples = reader.measured(some)
+        lights = np.ascontiguousarray(samples.lights[:, samples.pairs.light])
+        cosines = np.einsum("njd,nd->nj", samples.lights, reader.local_from_world[some, 2])
+        values = luminance_of(samples, np.maximum(cosines, 0)) * np.float32(samples.unit)
+        values = np.where(samples.seen, values, np.float32(np.nan))
+        normals, trust = photometric_normals(
+            values, lights, samples.views[:, 0], reader.local_from_world[some, 2]
+        )
+        parts.append((frames_towards(normals, samples.views[:, 0]), trust))
+    frames, scores = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    n = len(texels)
+    return {
+        "local_from_base": (frames @ np.swapaxes(base, 1, 2)).astype(np.float64),
+        "cluster": np.zeros(n, np.int32),
+        "score": scores.astype(np.float64),
+        "margin": np.ones(n),
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from reflfield.capture.capture import DIGEST_PARTS, PLANE, Capture
 from reflfield.errors import InputError
+from reflfield.field.clustered_pca import ONE_VIEW_COUNTS, USUAL_COUNTS
 from reflfield.observations.texel_reading import grid_sides
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline.cache import StageFolder
@@ -20,6 +21,8 @@ from reflfield.util.file_digests import FileDigests
 
 T = TypeVar("T")
 
+# Lights under which normals are found by photometric stereo at least.
+LEAST_LIGHTS = 6
 # Value of an option that is selected by comparison on held-out photographs.
 AUTO = "auto"
 # Stages whose results on a surface from normals stand beside those on the hull.
@@ -117,6 +120,9 @@ class Context:
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
+        counts = ONE_VIEW_COUNTS if self.photometric else USUAL_COUNTS
+        compression = self.options.compression.with_counts(*counts)
+        object.__setattr__(self, "options", replace(self.options, compression=compression))
 
     @property
     def asked_options(self) -> PipelineOptions:
@@ -143,6 +149,13 @@ class Context:
     def casts_shadows(self) -> bool:
         """Whether shadows could be traced: not of a flat base surface or unknown lights."""
         return self.capture.lights_known and not self.is_plane
+
+    @property
+    def photometric(self) -> bool:
+        """Whether frames are those of photometric stereo: of one view under known lights."""
+        one_view = self.is_plane and self.training.n_views == 1 and self.training.lights_known
+        enough = self.training.n_lights >= LEAST_LIGHTS
+        return one_view and enough and self.options.alignment.enabled
 
     @property
     def visibility_kind(self) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.factorization.clustering import Clusters
 from reflfield.field.bounds import beyond_bounds, beyond_clusters, probes
 from reflfield.field.clustered_model import (
     ClusteredModel,
@@ -18,7 +19,14 @@ from reflfield.field.clustered_model import (
     on_refined_grid,
     refined_sides,
 )
-from reflfield.field.clustered_pca import CompressionOptions, cluster_completed, fill_unobserved
+from reflfield.field.clustered_pca import (
+    CompressionOptions,
+    cluster_completed,
+    clusters_of,
+    completion_model,
+    fill_unobserved,
+    lifted_clusters,
+)
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.field.frame_refinement import refined_frames
 from reflfield.field.sample_fit import SampleFitOptions, fit_basis
@@ -26,8 +34,14 @@ from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline import results
 from reflfield.pipeline.alignment import local_frames
 from reflfield.pipeline.context import Context
+from reflfield.pipeline.one_view_fit import (
+    OneViewFit,
+    completed_block,
+    texels_block,
+    with_texels,
+)
 from reflfield.pipeline.quantisation_search import FieldMaker
-from reflfield.pipeline.resampling import Resampled
+from reflfield.pipeline.resampling import Resampled, fits_in_one_pass
 from reflfield.util.blocks import BlockFunction, Blocks
 
 Floats = NDArray[np.float32]
@@ -49,7 +63,10 @@ def fitted_model(
     reader = results.base_reader(context).rotated(
         local_frames(context, resampled.frames.local_from_base)
     )
-    model, reader = _selected_fit(_Fitting(context, resampled, reader, blocks), maker)
+    if fits_in_one_pass(context, maker.options):
+        model, reader = _fitted_in_one_pass(_Fitting(context, resampled, reader, blocks), maker)
+    else:
+        model, reader = _selected_fit(_Fitting(context, resampled, reader, blocks), maker)
     positions, measured = results.texels(context).position, results.measured_texels(context)
     return fill_unobserved(model, positions, measured), reader
 
@@ -98,9 +115,50 @@ class _Fitting:
         if not self.fits_samples(options):
             bounded = _within_bounds(self.context, model, self.reader, self.blocks, name)
             return bounded, self.reader
-        aligned = self.resampled.frames.free
+        # Normals of photometric stereo stay what they are.
+        free = self.resampled.frames.free
+        aligned = np.zeros(0, np.intp) if self.context.photometric else free
         model = of_usual_size(model)
         return _fitted_to_samples(self.context, model, self.reader, aligned, self.blocks, name)
+
+
+def _fitted_in_one_pass(
+    fitting: _Fitting, maker: FieldMaker
+) -> tuple[ClusteredModel, TexelReader]:
+    """Functions from the texels that shape the completion, then all texels block by block."""
+    context, reader, resampled = fitting.context, fitting.reader, fitting.resampled
+    chosen = results.random_texels(context, maker.options.training_texels)
+    counts = (reader.sides[0] ** 2, reader.sides[1] ** 2)
+    options, n_texels = maker.options, reader.n_texels
+    n_functions = options.clusters * (options.components + 1)
+    finer = refined_sides(reader.sides, n_functions, options.samples.grid_refinement)
+    completion = completion_model(resampled.completion, counts, n_texels)
+    completion = on_refined_grid(completion, finer)
+    # From their samples, as all texels are told apart later.
+    parts = fitting.blocks.map(
+        "coefficients for the clusters",
+        completed_block,
+        (replace(reader, sides=finer), completion),
+        reader.product_blocks_of(chosen),
+    )
+    local = clusters_of(parts.joined("coefficients"), options, context.options.seed)
+    model = lifted_clusters(resampled.completion, local, chosen, n_texels, counts)
+    first, second = options.samples.halves()
+    model = replace(of_usual_size(model), residuals=())
+    work = (context, chosen, fitting.blocks)
+    model = _basis_fitted(*work, model, reader, first, ", part 1")
+    model, reader = on_refined_grid(model, finer), replace(reader, sides=finer)
+    model = _basis_fitted(*work, model, reader, second, ", part 2")
+    clusters = Clusters(local.labels, local.means, local.bases, np.zeros((0, 0)))
+    measured = results.measured_texels(context)
+    parts = fitting.blocks.map(
+        "clusters and coefficients of all texels",
+        texels_block,
+        OneViewFit(reader, completion, clusters, model),
+        reader.product_blocks_of(measured),
+    )
+    cluster, coefficients = (parts.joined(name) for name in ("cluster", "coefficients"))
+    return with_texels(model, measured, cluster, coefficients), reader
 
 
 def _selected_fit(fitting: _Fitting, maker: FieldMaker) -> tuple[ClusteredModel, TexelReader]:
@@ -141,9 +199,12 @@ def _fitted_to_samples(
     options = context.options.compression.samples
     first, second = options.halves()
     model = replace(model, residuals=())
-    model = _fitted_once(context, model, reader, first, blocks, f"{name}, part 1")
     spread = np.radians(options.frame_spread_deg)
-    if len(aligned) and spread > 0:
+    refines = len(aligned) > 0 and spread > 0
+    work = (context, results.measured_texels(context), blocks)
+    model = _basis_fitted(*work, model, reader, first, f"{name}, part 1")
+    if refines:
+        model = _coefficients_fitted(context, model, reader, blocks, f"{name}, part 1")
         refined = blocks.map(
             f"frames against the model{name}",
             partial(frames_block, spread=float(spread)),
@@ -153,28 +214,36 @@ def _fitted_to_samples(
         frames = reader.local_from_world.copy()
         frames[aligned] = refined.joined("frames")
         reader = reader.rotated(frames)
+    model, reader = _on_finer_grid(model, reader, options.grid_refinement)
+    model = _basis_fitted(*work, model, reader, second, f"{name}, part 2")
+    return _coefficients_fitted(context, model, reader, blocks, f"{name}, part 2"), reader
+
+
+def _on_finer_grid(
+    model: ClusteredModel, reader: TexelReader, factor: float
+) -> tuple[ClusteredModel, TexelReader]:
+    """Model and reader on grids with up to so many times as many intervals."""
     n_functions = len(model.table) * (model.coefficients.shape[1] + 1)
-    sides = refined_sides(reader.sides, n_functions, options.grid_refinement)
-    model, reader = on_refined_grid(model, sides), replace(reader, sides=sides)
-    return _fitted_once(context, model, reader, second, blocks, f"{name}, part 2"), reader
+    sides = refined_sides(reader.sides, n_functions, factor)
+    return on_refined_grid(model, sides), replace(reader, sides=sides)
 
 
-def _fitted_once(
+def _basis_fitted(
     context: Context,
+    texels: Indices,
+    blocks: Blocks,
     model: ClusteredModel,
     reader: TexelReader,
     options: SampleFitOptions,
-    blocks: Blocks,
     part: str,
 ) -> ClusteredModel:
-    """Fit the basis to samples of some texels, then the coefficients of all, by blocks."""
-    measured = results.measured_texels(context)
+    """Fit the basis to samples of some of the texels, which have coefficients in it then."""
 
     def basis() -> dict[str, NDArray[Any]]:
         fit = fit_basis(
             reader.transformed,
             model,
-            measured,
+            texels,
             reader.product_bytes_per_texel,
             options,
             workers=context.resources.workers,
@@ -183,7 +252,14 @@ def _fitted_once(
         return {entry.name: np.asarray(getattr(fit, entry.name)) for entry in fields(fit)}
 
     stored: dict[str, Any] = blocks.once(f"basis on the samples{part}", basis)
-    model = ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
+    return ClusteredModel(**{**stored, "residuals": tuple(stored["residuals"].tolist())})
+
+
+def _coefficients_fitted(
+    context: Context, model: ClusteredModel, reader: TexelReader, blocks: Blocks, part: str
+) -> ClusteredModel:
+    """Fit the coefficients of all texels, by blocks."""
+    measured = results.measured_texels(context)
     work = f"coefficients on the samples{part}"
     return _with_coefficients(model, reader, measured, coefficients_block, blocks, work)
 

@@ -171,12 +171,13 @@ def _fits(context: Context, visibility: str, model: str) -> tuple[str, ...]:
     n = samples_per_texel(_with_visibility(context, visibility))
     fits = ("samples", "grid") if options.fits_samples(n) else ("grid", "samples")
     compared = len(context.held_out.photographs) > 0 and can_fit_samples(context, n)
-    return fits if compared else fits[:1]
+    # Of one view all frames are known, and with them the fit to enough samples is the better.
+    return fits if compared and not context.photometric else fits[:1]
 
 
 def can_fit_samples(context: Context, n_samples: float) -> bool:
     """Whether the fit to so many samples of a texel is determined, and they fit in memory."""
-    return context.asked_options.compression.n_components <= n_samples <= MOST_SAMPLES
+    return context.asked_options.compression.components <= n_samples <= MOST_SAMPLES
 
 
 def samples_per_texel(context: Context) -> float:

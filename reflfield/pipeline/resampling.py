@@ -33,12 +33,28 @@ class Resampled:
     completion : Completion
         Of the texels that shape the basis.
     coefficients : (n_texels, rank) float32
-        Of all texels in that basis.
+        Of all texels in that basis; of one view that is fitted in one pass, of those alone
+        that shape it.
     """
 
     frames: AlignedFrames
     completion: Completion
     coefficients: Floats
+
+
+def fits_in_one_pass(context: Context, options: CompressionOptions) -> bool:
+    """Whether texels get clusters and coefficients in one pass (`pipeline.one_view_fit`)."""
+    n = results.observed(context).count() / max(len(results.measured_texels(context)), 1)
+    searches = options.size > 0 or options.psnr > 0
+    return context.photometric and options.fits_samples(n) and not searches
+
+
+def texels_read(context: Context) -> dict[str, str]:
+    """Which texels of one view are completed, as the key of the stage has it."""
+    if not context.photometric:
+        return {}
+    few = fits_in_one_pass(context, context.options.compression)
+    return {"texels completed": "those of the basis" if few else "all"}
 
 
 def write_resampling(context: Context, folder: Path) -> dict[str, Any]:
@@ -59,10 +75,11 @@ def resampled(
 ) -> Resampled:
     """Resample all texels from their raw samples in some frames, and complete them."""
     reader = results.base_reader(context).rotated(local_frames(context, frames.local_from_base))
+    chosen = results.random_texels(context, options.training_texels)
     completion, coefficients = completed(
         reader,
-        results.random_texels(context, options.training_texels),
-        results.measured_texels(context),
+        chosen,
+        chosen if fits_in_one_pass(context, options) else results.measured_texels(context),
         rank=options.rank,
         seed=context.options.seed,
         resources=context.resources,

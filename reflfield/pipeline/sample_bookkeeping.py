@@ -104,7 +104,8 @@ def _texels(context: Context, counts: dict[str, dict[str, Any]]) -> Iterator[Cou
     """Texels of the atlas through completion and alignment, if any, and compression."""
     n = len(results.texels(context))
     if context.options.aligns:
-        yield from _aligned_texels(counts, n)
+        unseen = n - len(results.measured_texels(context))
+        yield from _aligned_texels(counts, n, unseen)
     fitted = counts["compression"]
     yield CountedItems(
         "compression",
@@ -117,17 +118,22 @@ def _texels(context: Context, counts: dict[str, dict[str, Any]]) -> Iterator[Cou
     )
 
 
-def _aligned_texels(counts: dict[str, dict[str, Any]], n: int) -> Iterator[CountedItems]:
-    """Texels through completion and alignment."""
-    completed = counts["completion"]
-    unseen = completed["texels without samples"]
-    yield CountedItems(
-        "completion",
-        "texels",
-        n,
-        {"completed": completed["texels completed"], "without samples": unseen},
-    )
+def _aligned_texels(
+    counts: dict[str, dict[str, Any]], n: int, unseen: int
+) -> Iterator[CountedItems]:
+    """Texels through completion, if any, and alignment."""
     aligned = counts["alignment"]
+    if "completion" in counts:  # of one view there is none
+        completed = counts["completion"]
+        yield CountedItems(
+            "completion",
+            "texels",
+            n,
+            {
+                "completed": completed["texels completed"],
+                "without samples": completed["texels without samples"],
+            },
+        )
     yield CountedItems(
         "alignment",
         "texels",

@@ -189,13 +189,13 @@ COMPLETION = Stage(
     completion.write_completion,
     after=(OBSERVATIONS,),
     options=lambda options: (options.completion, options.resampling, options.seed),
-    wanted=lambda context: context.options.aligns,
+    wanted=lambda context: context.options.aligns and not context.photometric,
 )
 # one local frame per texel
 ALIGNMENT = Stage(
     "alignment",
     alignment.write_alignment,
-    after=(COMPLETION,),
+    after=(OBSERVATIONS, COMPLETION),
     options=lambda options: (options.alignment, options.seed),
     wanted=lambda context: context.options.aligns,
 )
@@ -209,6 +209,7 @@ RESAMPLING = Stage(
         options.compression.training_texels,
         options.seed,
     ),
+    reads=resampling.texels_read,
     wanted=lambda context: context.options.aligns,
 )
 # model fitted to the raw samples, and to the photographs -> field file

@@ -136,7 +136,8 @@ def completion_score(context: Context, truth: Truth) -> CompletionError | None:
     """
     points = truth.samples()
     known = context.training.lights_known
-    if points is None or not known or not context.options.aligns:
+    completes = context.options.aligns and not context.photometric
+    if points is None or not known or not completes:
         return None
     counts, expected = (
         points["samples"].shape[1:3],

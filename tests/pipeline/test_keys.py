@@ -26,7 +26,7 @@ OPTIONS = with_tables(
     PipelineOptions(),
     {
         "resampling": {"visibility": "factored"},
-        "compression": {"fit": "samples"},
+        "compression": {"fit": "samples", "n_clusters": 8, "n_components": 6},
         "comparison": {"without_alignment": True, "rate_distortion": True},
     },
 )
