@@ -155,7 +155,10 @@ def _result(context: Context) -> Result:
 
 
 def read_options(
-    path: Path | str | None = None, settings: Iterable[str] = (), preset: str = STANDARD
+    path: Path | str | None = None,
+    settings: Iterable[str] = (),
+    preset: str = STANDARD,
+    capture: Capture | None = None,
 ) -> PipelineOptions:
     """Return options of a preset, overridden by a TOML file, and that by single settings.
 
@@ -167,6 +170,8 @@ def read_options(
         ``stage.option=value``.
     preset : {"standard", "preview", "best"}
         "preview" takes a fifth of the time, or less; "best" more. "standard" are the defaults.
+    capture : Capture, optional
+        That the preset is for: what suits the model of its fields is set as well.
 
     Raises
     ------
@@ -179,5 +184,5 @@ def read_options(
     64
     """
     tables = read_toml(Path(path)) if path is not None else {}
-    options = with_tables(PipelineOptions(), nested(preset_settings(preset)))
+    options = with_tables(PipelineOptions(), nested(preset_settings(preset, capture)))
     return with_tables(options, merged(tables, parse_settings(settings)))

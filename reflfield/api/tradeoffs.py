@@ -13,7 +13,7 @@ from reflfield.pipeline.hold_out import counted
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.tradeoff.cost_fit import fit_costs
 from reflfield.tradeoff.measured_ladder import measured_ladder
-from reflfield.tradeoff.presets import LADDER, choose_within
+from reflfield.tradeoff.presets import choose_within, ladder_of
 from reflfield.tradeoff.run_plan import RunPlan, plan_run
 from reflfield.tradeoff.sweep import Sweep
 from reflfield.tradeoff.sweep_results import SweepResult
@@ -140,7 +140,9 @@ def options_within(
     InputError
         If the time suffices for nothing; the message says what would.
     """
-    ladder, costs = (LADDER, None) if measured is None else measured_ladder(Path(measured))
+    ladder, costs = ladder_of(capture), None
+    if measured is not None:
+        ladder, costs = measured_ladder(Path(measured))
     choice = choose_within(
         *(budget, capture, options or PipelineOptions(), ladder),
         hold_out=hold_out,

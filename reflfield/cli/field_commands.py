@@ -76,11 +76,6 @@ def relight(
     follow_links: FollowLinks = False,
 ) -> None:
     """Render what a capture's photographs would show, or a turntable."""
-    from reflfield.api.captures import open_capture
-    from reflfield.api.fields import open_field
-    from reflfield.api.images import relight as relight_capture
-    from reflfield.api.images import render_turntable
-
     if (capture is None) == (orbit is None):
         raise InputError("relight: expected either --capture CAPTURE or --orbit N, one of them")
     of_map = {"convention": convention, "environment_up": environment_up,
@@ -92,21 +87,42 @@ def relight(
     refuse_without("--on MESH", on, {"tiles": tile})
     resources = limits(workers, max_memory)
     made_with = image_options(rays_per_pixel, resources)
-    opened = open_field(field, max_memory=resources.max_memory)
     with working():
-        if on is not None:
-            opened = opened.on_mesh(on, 1.0 if tile is None else tile)
+        opened = opened_on(field, on, tile, resources)
         if capture is not None:
-            wanted = open_capture(
-                capture, format, follow_links=follow_links, require_photographs=False
-            )
-            made = relight_capture(opened, wanted, out, **made_with)
+            made = relit_capture(opened, capture, out, format, follow_links, made_with)
         else:
             asked: dict[str, Any] = of_orbit | of_map | {"n_frames": orbit}
             stated = {name: value for name, value in asked.items() if value is not None}
-            made = render_turntable(opened, out, **stated, **made_with)
+            made = turntable(opened, out, stated | made_with)
     for path in made:
         say(str(path))
+
+
+def opened_on(field: Path, mesh: Path | None, tile: float | None, resources: Any) -> Any:
+    """The field, as the material of a mesh if there is one."""
+    from reflfield.api.fields import open_field
+
+    opened = open_field(field, max_memory=resources.max_memory)
+    return opened if mesh is None else opened.on_mesh(mesh, 1.0 if tile is None else tile)
+
+
+def relit_capture(
+    field: Any, capture: Path, out: Path, format: str | None, links: bool, made_with: Any
+) -> list[Path]:
+    """Images of a field from the cameras and under the lights of a capture."""
+    from reflfield.api.captures import open_capture
+    from reflfield.api.images import relight
+
+    wanted = open_capture(capture, format, follow_links=links, require_photographs=False)
+    return relight(field, wanted, out, **made_with)
+
+
+def turntable(field: Any, out: Path, options: dict[str, Any]) -> list[Path]:
+    """Images of a turntable of a field."""
+    from reflfield.api.images import render_turntable
+
+    return render_turntable(field, out, **options)
 
 
 def image_options(rays_per_pixel: int, resources: Any) -> dict[str, Any]:

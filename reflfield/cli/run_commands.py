@@ -107,7 +107,8 @@ def run(
     from reflfield.options import parse_hold_out, size_settings
 
     started = time.perf_counter()
-    options = read_options(config, [*(set_ or []), *size_settings(size, psnr)], preset)
+    words = [*(set_ or []), *size_settings(size, psnr)]
+    options = read_options(config, words, preset)  # what is wrong with them is said at once
     resources = limits(workers, max_memory, scheduler, store)
     held = parse_hold_out(hold_out)
     if scheduler is not None:  # whose workers run in folders of their own
@@ -119,6 +120,7 @@ def run(
         follow_links=follow_links,
         test_split=held.test,
     )
+    options = read_options(config, words, preset, photographed)
     asked: dict[str, Any] = {"options": options, "hold_out": held, "resources": resources}
     with working(GOES_ON):
         asked["options"] = _within(budget, tradeoff, photographed, asked)

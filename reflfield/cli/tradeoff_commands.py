@@ -53,9 +53,10 @@ def plan(
     from reflfield.api.tradeoffs import plan as plan_capture
     from reflfield.options import parse_hold_out
 
-    options = read_options(config, set_ or [], preset)
+    read_options(config, set_ or [], preset)  # what is wrong with them is said at once
     held, resources = parse_hold_out(hold_out), limits(workers, max_memory)
     photographed = _opened(capture, format, encoding, layer, follow_links, held.test)
+    options = read_options(config, set_ or [], preset, photographed)
     with working():
         planned = plan_capture(
             photographed, hold_out=held, options=options, resources=resources
@@ -104,6 +105,7 @@ def tradeoff(
     }
     test = asked["hold_out"].test
     photographed = _opened(capture, format, encoding, layer, follow_links, test)
+    asked["options"] = read_options(config, set_ or [], preset, photographed)
     with working(GOES_ON):
         measure_tradeoff(photographed, out, **asked, tell=say)
     say(str(out / "index.html"))

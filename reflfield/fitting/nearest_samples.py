@@ -26,6 +26,9 @@ from reflfield.fitting.texel_sample_fit import SampleBlock, SampleBlocks
 # Widths h that are tried, chords of the unit sphere: about the distances of directions in
 # captures of 12 x 12 to 64 x 64 photographs.
 WIDTHS = (0.1, 0.15, 0.2, 0.3)
+# Pairs of samples that are looked at with each width, about: a second. Of dense captures only
+# some of the samples are predicted.
+MOST_PAIRS = 100_000_000
 # Weight of a sample however far it is, so that there is always a mean.
 LEAST_WEIGHT = 1e-30
 
@@ -47,17 +50,25 @@ def nearest_samples_error(
         With the best of `WIDTHS`, in the units of `texel_sample_fit.solve_coefficients`; 0
         where nothing can be predicted.
     """
+    numbers = range(fitted.n_blocks)
+    pairs = sum(pool.map(lambda n: _pairs(fitted[n], measured[n]), numbers))
+    every = max(1, -(-pairs // MOST_PAIRS))
 
     def one(number: int) -> NDArray[np.float64]:
         sums = np.zeros((len(WIDTHS), 2))
         known, asked = (_arrays(blocks[number]) for blocks in (fitted, measured))
         for width, out in zip(WIDTHS, sums, strict=True):
-            _add_errors(known, asked, -0.5 / width**2, out)
+            _add_errors(known, asked, every, -0.5 / width**2, out)
         return sums
 
-    parts = list(pool.map(one, range(fitted.n_blocks)))
+    parts = list(pool.map(one, numbers))
     squares, count = np.sum([np.zeros((len(WIDTHS), 2)), *parts], axis=0).T
     return float(np.sqrt((squares / np.maximum(count, 1)).min()))
+
+
+def _pairs(known: SampleBlock, asked: SampleBlock) -> int:
+    """Pairs of a known and an asked sample of one texel."""
+    return int(np.diff(known.first) @ np.diff(asked.first))
 
 
 def _arrays(block: SampleBlock) -> tuple[Any, ...]:
@@ -87,12 +98,12 @@ def _mean(known: Any, row: int, towards: Any, scale: float, mean: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_errors(known: Any, asked: Any, scale: float, out: Any) -> None:
+def _add_errors(known: Any, asked: Any, every: int, scale: float, out: Any) -> None:
     """Add weighted squared errors of the asked samples, and how many values they are."""
     first, directions, values = asked
     mean = np.zeros(3)
     for row in range(len(first) - 1):
-        for s in range(first[row], first[row + 1]):
+        for s in range(first[row] + row % every, first[row + 1], every):
             _mean(known, row, directions[s], scale, mean)
             for c in range(3):
                 y, shown = values[s, c], np.float32(mean[c])

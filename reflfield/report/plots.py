@@ -153,8 +153,10 @@ def marked_curves(
             ]
             x, y = [mark.x for mark in shown], [mark.y for mark in shown]
             errors = [mark.y_error for mark in shown]
-            line = "-" if name in joined else ""
-            axes.plot(x, y, line, color=colour, label=name, marker="o", markersize=3.5)
+            line = "-" if name in joined else "none"
+            axes.plot(
+                *(x, y), color=colour, label=name, linestyle=line, marker="o", markersize=3.5
+            )
             axes.errorbar(x, y, errors, fmt="none", ecolor=colour, elinewidth=0.8, alpha=0.5)
             _name_points(axes, shown, colour)
         _scale(axes, "x", log_x)

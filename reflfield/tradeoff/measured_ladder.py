@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from reflfield.errors import InputError
+from reflfield.tradeoff.presets import Settings
 from reflfield.tradeoff.stage_costs import UnitCosts, read_costs
 from reflfield.tradeoff.sweep_results import front_of
 from reflfield.tradeoff.swept_options import DEFAULT_NAME, SHOWING, SWEPT, Value
@@ -17,7 +19,7 @@ LARGEST_DOCUMENT = 16 << 20
 KNOWN = {option.name for option in SWEPT}
 
 
-def measured_ladder(folder: Path) -> tuple[dict[str, dict[str, Value]], UnitCosts]:
+def measured_ladder(folder: Path) -> tuple[Mapping[str, Settings], UnitCosts]:
     """Front of a finished sweep by rising quality, and the unit costs fitted to its runs.
 
     Parameters
@@ -27,7 +29,7 @@ def measured_ladder(folder: Path) -> tuple[dict[str, dict[str, Value]], UnitCost
 
     Returns
     -------
-    ladder : dict of str to dict
+    ladder : mapping of str to mapping
         Settings by the names of the configurations.
     costs : UnitCosts
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from reflfield.capture.capture import Capture
 from reflfield.errors import InputError
+from reflfield.field.clustered_pca import CLUSTERED
 from reflfield.options import HoldOut, Resources, with_tables
 from reflfield.pipeline import stages
 from reflfield.pipeline.pipeline_options import PipelineOptions
@@ -15,28 +16,50 @@ from reflfield.tradeoff.machine_speed import machine_seconds, slowness
 from reflfield.tradeoff.run_plan import RunPlan, plan_of
 from reflfield.tradeoff.stage_costs import UnitCosts, shipped_costs
 from reflfield.tradeoff.swept_options import Value, nested
-from reflfield.tradeoff.work_counts import counts_of, covered_share, planned_context
+from reflfield.tradeoff.work_counts import (
+    counts_of,
+    covered_share,
+    planned_context,
+    planned_model,
+)
 
 Settings = Mapping[str, Value]
 
 PREVIEW, STANDARD, BEST = "preview", "standard", "best"
-# From the fronts of sweeps (`tradeoff/README.md`), by rising time: what does not matter to the
-# model that a run fits changes nothing.
+# From sweeps and whole runs (`tests/benchmarks/bench_presets.py`), by rising time. What does
+# not matter to the model that a run fits changes nothing.
 LADDER: dict[str, Settings] = {
     PREVIEW: {
         "hull.resolution": 96,
-        "texture.texels_per_pixel": 0.8,
-        "compression.half_vector.n_lobes": 2,
-        "compression.half_vector.image_steps": 0,
+        "hull.n_triangles": 5_000,
+        "texture.texels_per_pixel": 0.65,
+        "texture.largest": 256,
+        "indirect.n_components": 2,
         "completion.passes": 1,
+        "completion.rank": 6,
         "alignment.iterations": 1,
         "alignment.refine": False,
-        "compression.fit": "auto",
+        "alignment.band_limit": 6,
+        "compression.half_vector.n_lobes": 1,
+        "compression.half_vector.image_steps": 1,
+        "compression.half_vector.surface_from_normals": False,
+        "compression.rank": 8,
+        "relighting.samples_per_pixel": 4,
     },
     STANDARD: {},
-    BEST: {"texture.texels_per_pixel": 2.2, "compression.half_vector.image_steps": 4},
+    BEST: {
+        "texture.texels_per_pixel": 2.0,
+        "compression.half_vector.n_lobes": 4,
+        "compression.half_vector.image_steps": 4,
+        "compression.n_components": 12,
+        "compression.samples.rounds": 8,
+    },
 }
 PRESETS = (PREVIEW, STANDARD, BEST)
+# Of a preview by clusters: one fit, the quick one, which to ask for of other captures would ask
+# for clusters; and nodes of the grids along a side, where there would be more.
+QUICK_FIT: Settings = {"compression.fit": "grid"}
+MOST_NODES = 7
 
 
 @dataclass(frozen=True)
@@ -63,8 +86,14 @@ class Choice:
         )
 
 
-def preset_settings(name: str) -> dict[str, Value]:
+def preset_settings(name: str, capture: Capture | None = None) -> dict[str, Value]:
     """Settings of a preset, by ``stage.option``.
+
+    Parameters
+    ----------
+    name : {"preview", "standard", "best"}
+    capture : Capture, optional
+        With what suits the model that its fields have.
 
     Raises
     ------
@@ -78,7 +107,25 @@ def preset_settings(name: str) -> dict[str, Value]:
     """
     if name not in PRESETS:
         raise InputError(f"preset: expected one of {', '.join(PRESETS)}, received {name!r}")
-    return dict(LADDER[name])
+    settings = dict(LADDER[name])
+    if name == PREVIEW and capture is not None:
+        settings |= quick_clusters(capture)
+    return settings
+
+
+def quick_clusters(capture: Capture) -> dict[str, Value]:
+    """Settings of a preview by clusters; none where fields of the capture have none."""
+    context = planned_context(capture, PipelineOptions())
+    if planned_model(context) != CLUSTERED:
+        return {}
+    sides = zip(("view_side", "light_side"), context.grid_sides, strict=True)
+    fewer = {f"resampling.{name}": MOST_NODES for name, side in sides if side > MOST_NODES}
+    return {**QUICK_FIT, **fewer}
+
+
+def ladder_of(capture: Capture) -> Mapping[str, Settings]:
+    """Settings of all presets for a capture, by rising time."""
+    return {name: preset_settings(name, capture) for name in LADDER}
 
 
 def choose_within(

@@ -64,8 +64,9 @@ from reflfield.util.progress import report
 # In the folder of a sweep: runs, and digests of the files that were read.
 RUNS, FILES = "runs", "files.json"
 LARGEST_OUTCOME = 16 << 20
-# Shares of the budget after which no more options are varied alone, and together.
-ALONE_UNTIL, TOGETHER_UNTIL = 0.6, 0.8
+# Shares of the budget after which no more options are varied alone, and together,
+# nor timed again.
+ALONE_UNTIL, TOGETHER_UNTIL, AGAIN_UNTIL = 0.6, 0.8, 0.92
 # Share of the lights, or views, in the first round of halving.
 FIRST_ROUND = 0.5
 # Complete runs of each configuration of the front, its first one included, that times are of.
@@ -287,7 +288,7 @@ class Sweep:
             for i, measured in enumerate(timed):
                 report("timed again", (turn - 1) * len(timed) + i, (REPEATS - 1) * len(timed))
                 seconds = self._expected_here(measured.seconds)
-                if self._has_time(seconds, 1.0) or self._is_done(measured, turn):
+                if self._has_time(seconds, AGAIN_UNTIL) or self._is_done(measured, turn):
                     self._time_again(measured, turn, tell)
 
     def _time_again(self, measured: Measured, turn: int, tell: Tell) -> None:

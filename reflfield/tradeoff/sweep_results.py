@@ -54,9 +54,14 @@ class Measured:
 
     @cached_property
     def cpu_seconds(self) -> float:
-        """CPU time of all stages, as if nothing had been taken over; median of the repeats."""
+        """CPU time of all stages, as if nothing had been taken over; median of the runs."""
+        return median(self.cpu_times)
+
+    @property
+    def cpu_times(self) -> list[float]:
+        """CPU time of all stages of the first run, and of each that was complete again."""
         once = sum(cpu_of(record) for record in self.outcome["stages"])
-        return median([once, *(repeat["cpu"] for repeat in self.repeats)])
+        return [once, *(repeat["cpu"] for repeat in self.repeats)]
 
     @cached_property
     def seconds(self) -> float:
@@ -204,7 +209,8 @@ def paths(default: Measured, alone: Iterable[Measured]) -> Iterator[Configuratio
 # --- what is picked --------------------------------------------------------------------------
 
 # dB that a pick may be below the best: to look at while one works, and for good.
-FAST_LOSS, BALANCED_LOSS = 3.0, 0.5
+# Less than the last is no difference.
+FAST_LOSS, BALANCED_LOSS, BEST_LOSS = 3.0, 0.5, 0.05
 FAST, BALANCED, BEST = "fast", "balanced", "best"
 
 
@@ -215,16 +221,15 @@ def picks(result: SweepResult) -> dict[str, Measured]:
     -------
     dict of str to Measured
         "fast": the least time at most 3 dB below the best; "balanced": at most 0.5 dB;
-        "best".
+        "best": at most 0.05 dB.
     """
     whole = result.whole
     front = [whole[i] for i in front_of([(m.cpu_seconds, m.psnr) for m in whole])]
-    best = front[-1]
-
-    def cheapest(loss: float) -> Measured:
-        return next(m for m in front if m.psnr >= best.psnr - loss)
-
-    return {FAST: cheapest(FAST_LOSS), BALANCED: cheapest(BALANCED_LOSS), BEST: best}
+    losses = {FAST: FAST_LOSS, BALANCED: BALANCED_LOSS, BEST: BEST_LOSS}
+    return {
+        name: next(m for m in front if m.psnr >= front[-1].psnr - loss)
+        for name, loss in losses.items()
+    }
 
 
 def gain(measured: Measured, default: Measured) -> tuple[float, float]:

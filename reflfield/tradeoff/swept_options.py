@@ -19,7 +19,7 @@ from reflfield.tradeoff.work_counts import WorkCounts
 Value = bool | int | float | str
 # Shares of the views and the lights that make the field: no options of a run.
 VIEWS, LIGHTS = "views", "lights"
-SHARES = (0.25, 0.5, 0.75)
+SHARES = (0.5, 0.25, 0.75)
 # What only changes how a field is shown, not the field.
 SHOWING = ("relighting.samples_per_pixel",)
 DEFAULT_NAME = "default"
@@ -55,14 +55,21 @@ class SweptOption:
         """Whether the option changes anything in a run with such counts."""
         if self.name in (VIEWS, LIGHTS):
             return (counts.n_views if self.name == VIEWS else counts.n_lights) >= 4
-        shaded = counts.shades or self.stage != "indirect"
-        return counts.model in self.models and not (self.solid and counts.is_plane) and shaded
+        needed = {
+            "resampling.view_side": counts.n_views > 1,
+            "resampling.light_side": counts.n_lights > 1,
+            "indirect.enabled": counts.shades,
+            "indirect.n_components": counts.shades,
+        }
+        usable = counts.model in self.models and not (self.solid and counts.is_plane)
+        return usable and needed.get(self.name, True)
 
 
 _HALF, _CLUSTERS = (HALF_VECTOR,), (CLUSTERED,)
 # The first are tried first, where the time does not suffice for all.
 SWEPT = (
     SweptOption("texture.texels_per_pixel", (0.6, 0.8, 1.1, 1.6, 2.2), solid=True),
+    SweptOption("texture.largest", (128, 256, 512, 1024), solid=True),
     SweptOption("compression.half_vector.image_steps", (0, 1, 2, 4), _HALF),
     SweptOption("compression.half_vector.n_lobes", ("auto", 1, 2, 3, 4), _HALF),
     SweptOption("compression.fit", ("auto", "grid", "samples"), _CLUSTERS),
@@ -73,6 +80,8 @@ SWEPT = (
     SweptOption("hull.resolution", (96, 128, 192, 256), solid=True),
     SweptOption("alignment.refine", (False, True), _CLUSTERS),
     SweptOption("alignment.band_limit", (4, 6, 8, 12), _CLUSTERS),
+    SweptOption("resampling.light_side", (0, 5, 7, 9, 11, 13), _CLUSTERS),
+    SweptOption("resampling.view_side", (0, 5, 7, 9, 11, 13), _CLUSTERS),
     SweptOption("completion.passes", (1, 2, 4, 8), _CLUSTERS),
     SweptOption("completion.rank", (6, 12, 24), _CLUSTERS),
     SweptOption("compression.n_components", (3, 6, 12), _CLUSTERS),
@@ -121,9 +130,24 @@ class Configuration:
         >>> Configuration().name
         'default'
         """
-        shares = [(n, getattr(self, n)) for n in (VIEWS, LIGHTS) if getattr(self, n) < 1]
-        words = [f"{name}={shown(value)}" for name, value in self.settings]
-        return ", ".join([*words, *(f"{n}={s:.0%}" for n, s in shares)]) or DEFAULT_NAME
+        return self._named(dict(self.settings))
+
+    @property
+    def short_name(self) -> str:
+        """The differences in words, without the stages of options in groups of their own.
+
+        Examples
+        --------
+        >>> Configuration((("compression.half_vector.n_lobes", 1),)).short_name
+        'half_vector.n_lobes=1'
+        """
+        return self._named({".".join(n.split(".")[-2:]): v for n, v in self.settings})
+
+    def _named(self, settings: Mapping[str, Value]) -> str:
+        shares = {VIEWS: self.views, LIGHTS: self.lights}
+        words = [f"{name}={shown(value)}" for name, value in settings.items()]
+        words += [f"{name}={share:.0%}" for name, share in shares.items() if share < 1]
+        return ", ".join(words) or DEFAULT_NAME
 
     @property
     def folder(self) -> str:
@@ -216,7 +240,8 @@ def one_at_a_time(
     for option in swept:
         usual = value_of(options, option.name)
         others = [value for value in option.values if not same(value, usual)]
-        left[option] = sorted(others, key=partial(_far, usual))
+        is_share = option.name in (VIEWS, LIGHTS)
+        left[option] = others if is_share else sorted(others, key=partial(_far, usual))
     while any(left.values()):
         for option, values in left.items():
             if values:

@@ -133,7 +133,6 @@ def picks_section(result: SweepResult) -> Section:
         rows.append(
             (
                 name,
-                measured.configuration.name,
                 f"{measured.psnr:.2f}",
                 f"{gained:+.2f} ± {error:.2f}",
                 _mean(measured, "reported"),
@@ -143,14 +142,14 @@ def picks_section(result: SweepResult) -> Section:
             )
         )
     header = (
-        *("pick", "configuration", "chosen on, dB", "gain, dB", "reported, dB", "unseen, dB"),
+        *("pick", "chosen on, dB", "gain, dB", "reported, dB", "unseen, dB"),
         *("CPU", "field"),
     )
     table = Table(
         header,
         tuple(rows),
-        "Chosen by the photographs of the third column; the fifth shows photographs that "
-        "nothing was chosen by.",
+        "Chosen by the photographs of the first PSNR; those that are reported have not been "
+        "chosen by.",
         emphasised=(0,),
     )
     commands = [
@@ -159,8 +158,8 @@ def picks_section(result: SweepResult) -> Section:
     ]
     return Section(
         "Three configurations of the front",
-        "fast: the least time at most 3 dB below the best; balanced: at most 0.5 dB below it; "
-        "best. Times are those of all stages up to the comparison.",
+        "The least time at most 3 dB below the best (fast), at most 0.5 dB (balanced) and "
+        "0.05 dB (best). Times are those of all stages up to the comparison.",
         (table, *commands),
     )
 
@@ -198,13 +197,11 @@ def front_section(result: SweepResult) -> Section:
         joined=("front",),
     )
     rows = tuple(
-        (m.configuration.name, f"{m.psnr:.2f}", f"{m.cpu_seconds:.1f}", *_scatter(m))
+        (m.configuration.short_name, f"{m.psnr:.2f}", f"{m.cpu_seconds:.1f}", *_scatter(m))
         for m in front
     )
     header = ("configuration", PSNR, TIME, "runs", "least", "most")
-    table = Table(
-        header, rows, "CPU time: median of complete runs, with the least and the most."
-    )
+    table = Table(header, rows, "CPU time: median of the runs, with the least and the most.")
     figure = Figure((Panel(plot),), "The default is ringed; bars: standard error of the gain.")
     return Section(
         "Pareto front",
@@ -216,10 +213,8 @@ def front_section(result: SweepResult) -> Section:
 
 def _scatter(measured: Measured) -> tuple[Cell, Cell, Cell]:
     """Number of runs of a configuration, and its least and largest CPU time."""
-    times = [repeat["cpu"] for repeat in measured.repeats]
-    if not times:
-        return 1, None, None
-    return 1 + len(times), f"{min(times):.1f}", f"{max(times):.1f}"
+    times = measured.cpu_times
+    return len(times), f"{min(times):.1f}", f"{max(times):.1f}"
 
 
 def _mark(measured: Measured, default: Measured, label: str) -> Mark:
@@ -335,7 +330,7 @@ def configurations_section(result: SweepResult) -> Section:
 def _row(measured: Measured, default: Measured) -> tuple[Cell, ...]:
     gained, error = gain(measured, default)
     return (
-        measured.configuration.name,
+        measured.configuration.short_name,
         PARTS[measured.stage_of_sweep],
         f"{measured.psnr:.2f}",
         f"{gained:+.2f}".replace("-", "−"),
@@ -356,7 +351,7 @@ def truth_sections(result: SweepResult) -> Iterator[Section]:
         return
     names = sorted({name for m in some for name in m.outcome["truth"]})
     rows = tuple(
-        (m.configuration.name, *(_number(m.outcome["truth"].get(name)) for name in names))
+        (m.configuration.short_name, *(_number(m.outcome["truth"].get(name)) for name in names))
         for m in some
     )
     yield Section(

@@ -224,6 +224,6 @@ def planned_model(context: Context) -> str:
 def _n_fits(context: Context, model: str) -> int:
     """Fits that are compared on held-out photographs."""
     automatic = model == CLUSTERED and context.options.compression.fit == AUTO
-    compared = len(context.held_out.photographs) > 0
+    compared = len(context.held_out.photographs) > 0 and not context.photometric
     n = samples_of_texel(context)
     return 2 if automatic and compared and can_fit_samples(context, n) else 1

@@ -5,8 +5,8 @@
     python tests/benchmarks/bench_plan.py --out RUNS --fit        # and fit the unit costs anew
 
 Each run is predicted first, then made by the command that a user would type, in RUNS/NAME, in
-a process of its own; what RUNS has already of it is not computed again. CPU times are compared,
-which other programs on the machine change little; wall times are shown with them.
+a process of its own; those that are finished in RUNS are not made again. CPU times are
+compared, which other programs on the machine change less; wall times are shown with them.
 
 Writes results/plan.json. With --fit, unit costs are fitted to these runs, and to the stages in
 results/capture_*.json, and written to reflfield/tradeoff/unit_costs.json; the errors that are
@@ -103,6 +103,13 @@ def command(module, *words):
     if done.returncode:
         tail = "\n".join(done.stderr.splitlines()[-5:])
         raise RuntimeError(f"{module}: status {done.returncode}\n{tail}")
+
+
+def timings_of(out, *words):
+    """Times of a run that has been made, or is made by a command."""
+    if not (out / "timings.json").is_file():
+        command(*words)
+    return json.loads((out / "timings.json").read_text())
 
 
 def capture_of(run, out):
@@ -206,11 +213,10 @@ def main():
         capture = capture_of(run, options.out)
         settings = [word for setting in run.settings for word in ("--set", setting)]
         out = options.out / name
-        command(
-            *("reflfield", "run", capture, "-o", out, "--hold-out", run.held_out),
+        timings = timings_of(
+            *(out, "reflfield", "run", capture, "-o", out, "--hold-out", run.held_out),
             *("--workers", options.workers, *settings),
         )
-        timings = json.loads((out / "timings.json").read_text())
         runs[name] = (*prepared(run, capture, options.workers), timings)
     if options.fit:
         fit(runs, here, options)

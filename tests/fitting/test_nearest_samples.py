@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from reflfield.fitting import nearest_samples
 from reflfield.fitting.lobe_count import of_views, views_left_out
 from reflfield.fitting.nearest_samples import LEAST_WEIGHT, WIDTHS, nearest_samples_error
 from reflfield.fitting.robust_weights import HUBER, squared_weight
@@ -55,6 +56,18 @@ def test_error_is_that_of_the_weighted_means(block):
     expected = np.sqrt((squares[:, 0] / squares[:, 1]).min())
     # Weights are float32, of residuals that are rounded to it: some eps of the values.
     assert error_of(fitted, measured) == pytest.approx(expected, rel=1e-5)
+
+
+def test_of_many_samples_some_are_predicted(block, monkeypatch):
+    """Every third of each texel, begun at another one: a third of the sums, about as large."""
+    whole = error_of(*parts_of(block))
+    fitted, measured = parts_of(block)
+    pairs = sum(np.diff(fitted[0].first) * np.diff(measured[0].first))
+    monkeypatch.setattr(nearest_samples, "MOST_PAIRS", int(pairs // 3) + 1)
+    some = error_of(fitted, measured)
+    assert some != whole
+    # A third of some hundred squares of like size: two of three scatter by a third at most.
+    assert some == pytest.approx(whole, rel=0.35)
 
 
 def test_samples_that_do_not_vary_are_shown(block):

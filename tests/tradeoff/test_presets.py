@@ -1,5 +1,7 @@
 """Presets, and the best of them within a time."""
 
+from dataclasses import replace
+
 import pytest
 
 from reflfield.api.reconstruction import read_options
@@ -65,3 +67,18 @@ def test_a_time_that_suffices_for_nothing_is_refused(choose):
 def test_what_is_no_time_is_refused(text):
     with pytest.raises(InputError, match="budget: expected a time above 0"):
         parse_seconds(text)
+
+
+def test_a_preview_by_clusters_is_fitted_once(product):
+    """Ten views under one light tell too little for the half-vector model."""
+    one_light = replace(
+        product, photographs=tuple(p for p in product.photographs if not p.light)
+    )
+    assert preset_settings("preview", one_light)["compression.fit"] == "grid"
+    assert preset_settings("best", one_light) == preset_settings("best")
+
+
+def test_a_preview_of_a_dome_asks_for_no_clusters(product):
+    settings = preset_settings("preview", product)
+    assert "compression.fit" not in settings
+    assert settings == preset_settings("preview")
