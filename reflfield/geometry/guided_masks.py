@@ -222,7 +222,7 @@ def has_colours(encoded: Bytes, colours: Sequence[tuple[float, float, float]]) -
     >>> has_colours(pixels, [(0.15, 0.45, 0.23)]).tolist()
     [[True, True, False]]
     """
-    weights = np.float32([LIGHTNESS_WEIGHT, 1.0, 1.0])
+    weights = np.array([LIGHTNESS_WEIGHT, 1.0, 1.0], np.float32)
     lab = cv2.cvtColor(encoded.astype(np.float32) / 255, cv2.COLOR_RGB2LAB) * weights
     named = np.asarray(colours, np.float32)[None]
     named_lab = cv2.cvtColor(named, cv2.COLOR_RGB2LAB)[0] * weights
