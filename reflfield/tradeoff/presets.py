@@ -32,7 +32,7 @@ LADDER: dict[str, Settings] = {
     PREVIEW: {
         "hull.resolution": 96,
         "hull.n_triangles": 5_000,
-        "texture.texels_per_pixel": 0.65,
+        "texture.texels_per_pixel": 0.8,
         "texture.largest": 256,
         "indirect.n_components": 2,
         "completion.passes": 1,
@@ -114,9 +114,12 @@ def preset_settings(name: str, capture: Capture | None = None) -> dict[str, Valu
 
 
 def quick_clusters(capture: Capture) -> dict[str, Value]:
-    """Settings of a preview by clusters; none where fields of the capture have none."""
+    """Settings of a preview by clusters; none where fields of the capture have none.
+
+    Nor of one view under many lights, whose fit is one pass, and takes less than its normals.
+    """
     context = planned_context(capture, PipelineOptions())
-    if planned_model(context) != CLUSTERED:
+    if context.photometric or planned_model(context) != CLUSTERED:
         return {}
     sides = zip(("view_side", "light_side"), context.grid_sides, strict=True)
     fewer = {f"resampling.{name}": MOST_NODES for name, side in sides if side > MOST_NODES}

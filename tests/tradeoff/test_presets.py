@@ -78,6 +78,13 @@ def test_a_preview_by_clusters_is_fitted_once(product):
     assert preset_settings("best", one_light) == preset_settings("best")
 
 
+def test_a_preview_of_one_view_keeps_its_fit(product):
+    """Its frames are those of photometric stereo, and all texels are fitted in one pass."""
+    of_first = tuple(p for p in product.photographs if p.camera == 0)
+    one_view = replace(product, photographs=of_first, base_geometry="plane").subset([0])
+    assert "compression.fit" not in preset_settings("preview", one_view)
+
+
 def test_a_preview_of_a_dome_asks_for_no_clusters(product):
     settings = preset_settings("preview", product)
     assert "compression.fit" not in settings
