@@ -114,12 +114,9 @@ def preset_settings(name: str, capture: Capture | None = None) -> dict[str, Valu
 
 
 def quick_clusters(capture: Capture) -> dict[str, Value]:
-    """Settings of a preview by clusters; none where fields of the capture have none.
-
-    Nor of one view under many lights, whose fit is one pass, and takes less than its normals.
-    """
+    """Settings of a preview by clusters; none where fields of the capture have none."""
     context = planned_context(capture, PipelineOptions())
-    if context.photometric or planned_model(context) != CLUSTERED:
+    if planned_model(context) != CLUSTERED:
         return {}
     sides = zip(("view_side", "light_side"), context.grid_sides, strict=True)
     fewer = {f"resampling.{name}": MOST_NODES for name, side in sides if side > MOST_NODES}
