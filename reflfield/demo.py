@@ -53,7 +53,7 @@ def run_demo(out: Path, workers: int) -> Result:
     with compiling_ahead():
         capture = out / "capture"
         if not (capture / "capture.json").is_file():
-            simulate(capture, workers)
+            simulate(capture, workers, SCENE)
         return reconstruct(
             capture,
             out,
@@ -82,11 +82,14 @@ def compiling_ahead() -> Iterator[None]:
         process.wait()
 
 
-def simulate(capture: Path, workers: int) -> None:
-    """Run the simulator as a process of its own: the two share nothing but files."""
+def simulate(capture: Path, workers: int, scene: str = "demo_vase") -> None:
+    """Run the simulator as a process of its own: the two share nothing but files.
+
+    `scene` is the name of a shipped one, or the path of a file.
+    """
     capture.parent.mkdir(parents=True, exist_ok=True)
     report("simulating the dome", 0, 1)
-    command = [simulator(), "render", SCENE, "-o", str(capture), "--workers", str(workers)]
+    command = [simulator(), "render", scene, "-o", str(capture), "--workers", str(workers)]
     done = subprocess.run(tied(command), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise ReflfieldError(

@@ -50,6 +50,9 @@ FLAGS = {
     "view": "--view",
     "mesh": "--on",
     "tiles": "--tile",
+    "only": "--only",
+    "n_directions": "--directions",
+    "photograph_side": "--pixels",
 }
 # Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
 RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}

@@ -33,6 +33,7 @@ PACKAGES = (
     "tradeoff",
     "api",
     "demo",
+    "reproduction",
     "flags",
     "cli",
     "__main__",

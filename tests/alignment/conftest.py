@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from reflfield.reproduction import paper_forms as forms
+from reflfield.reproduction import paper_scene
+
 HERE = Path(__file__).resolve().parent
-BENCHMARKS = HERE.parent / "benchmarks"
 
 
 def _module(path):
@@ -19,7 +21,7 @@ def _module(path):
 @pytest.fixture(scope="session")
 def scene():
     """The synthetic scene of the paper's section 5.1."""
-    return _module(BENCHMARKS / "synthetic_btf.py")
+    return paper_scene
 
 
 @pytest.fixture(scope="session")
@@ -31,4 +33,4 @@ def references():
 @pytest.fixture(scope="session")
 def paper_forms():
     """The paper's sums on whole grids of rotations."""
-    return _module(HERE / "paper_forms.py")
+    return forms

@@ -14,11 +14,11 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from alignment import paper_forms
 from benchmarks.measuring import measured
 from benchmarks.peers import Pysofft, S2fft
 
 from reflfield.alignment import align, search
+from reflfield.reproduction import paper_forms
 from reflfield.sphere.coupling import couple
 from reflfield.sphere.harmonic_projection import Projector
 from reflfield.sphere.rotations import rotation_angle

@@ -6,7 +6,7 @@ On the synthetic scene of section 5.1 (81 x 81 directions). Points, in CPU time 
 
 * exact: search of the coupled series over all rotations, each refined to its peak;
 * K = 2 .. 8: the paper's Eq. 11, highest of its (2L)^3 grid, computed as in
-  `tests/alignment/paper_forms.py`, and after Newton steps on the series of the truncated
+  `reflfield/reproduction/paper_forms.py`, and after Newton steps on the series of the truncated
   functions;
 * brute force: Eq. 10 on that grid, and after Newton steps on the exact series (timed on a few
   texels; the errors are those of all, whose maxima the exact series has at the same rotations);
@@ -35,21 +35,21 @@ sys.path[:0] = [str(TESTS), str(TESTS / "alignment")]
 
 import matplotlib  # noqa: E402
 import numpy as np  # noqa: E402
-import paper_forms  # noqa: E402
 from benchmarks.measuring import Results  # noqa: E402
-from benchmarks.synthetic_btf import (  # noqa: E402
-    dome_directions,
-    frame_errors,
-    relief_frames,
-    sample_texels,
-    with_the_truths_tangents,
-)
 
 from reflfield.alignment import align, search  # noqa: E402
 from reflfield.alignment.correlation import spectrum  # noqa: E402
 from reflfield.alignment.newton_ascent import follow  # noqa: E402
 from reflfield.alignment.refinement import RefinementOptions  # noqa: E402
 from reflfield.report.plots import SERIES_COLOURS  # noqa: E402
+from reflfield.reproduction import paper_forms  # noqa: E402
+from reflfield.reproduction.paper_scene import (  # noqa: E402
+    dome_directions,
+    frame_errors,
+    relief_frames,
+    sample_texels,
+    with_the_truths_tangents,
+)
 from reflfield.sphere.coupling import couple  # noqa: E402
 from reflfield.sphere.harmonic_projection import Projector  # noqa: E402
 

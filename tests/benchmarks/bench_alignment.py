@@ -33,16 +33,16 @@ sys.path.insert(0, str(HERE.parent))
 import numpy as np  # noqa: E402
 from benchmarks.measuring import Results, on_cores  # noqa: E402
 from benchmarks.peers import missing  # noqa: E402
-from benchmarks.synthetic_btf import (  # noqa: E402
+
+from reflfield.alignment import search  # noqa: E402
+from reflfield.alignment.correlation import spectrum  # noqa: E402
+from reflfield.alignment.newton_ascent import follow  # noqa: E402
+from reflfield.reproduction.paper_scene import (  # noqa: E402
     RINGS_151,
     dome_directions,
     relief_frames,
     sample_texels,
 )
-
-from reflfield.alignment import search  # noqa: E402
-from reflfield.alignment.correlation import spectrum  # noqa: E402
-from reflfield.alignment.newton_ascent import follow  # noqa: E402
 from reflfield.sphere.coupling import couple  # noqa: E402
 from reflfield.sphere.harmonic_projection import (  # noqa: E402
     Projector,

@@ -22,15 +22,15 @@ sys.path.insert(0, str(HERE.parent))
 
 import numpy as np  # noqa: E402
 from benchmarks.measuring import Results  # noqa: E402
-from benchmarks.synthetic_btf import (  # noqa: E402
+from scipy.optimize import linear_sum_assignment  # noqa: E402
+
+from reflfield.alignment import align  # noqa: E402
+from reflfield.reproduction.paper_scene import (  # noqa: E402
     dome_directions,
     frame_errors,
     relief_frames,
     sample_texels,
 )
-from scipy.optimize import linear_sum_assignment  # noqa: E402
-
-from reflfield.alignment import align  # noqa: E402
 
 BASE = {"nu": 8.0, "nv": 60.0}
 SETS = {

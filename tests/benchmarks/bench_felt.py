@@ -32,44 +32,7 @@ from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment import RefinementOptions, align
-
-LAST_RING = np.deg2rad(75.0)
-
-
-def measured(folder):
-    """(151, 3) directions and (views, lights) reflectance without the light's cosine."""
-    directions = np.fromfile(folder / "xyz_loc.bin").reshape(4, 151)[:3].T
-    log_mean = np.fromfile(folder / "felt05_mean_std.bin").reshape(2, 151, 151)[0]
-    # The file holds a third of log(Y) + log(U) + log(V); the felt is nearly grey.
-    luminance = np.exp(3.0 * log_mean)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return directions, luminance / directions[:, 2]
-
-
-class Felt:
-    """The measured reflectance as a smooth function of two directions."""
-
-    def __init__(self, directions, reflectance):
-        self.spline = RBFInterpolator(
-            directions, np.eye(len(directions)), kernel="thin_plate_spline"
-        )
-        self.log = np.log(reflectance)
-
-    def shares(self, directions):
-        """(n, 151) weights of the measured directions; those beyond the last ring are its."""
-        polar = np.minimum(np.arccos(np.clip(directions[:, 2], -1, 1)), LAST_RING)
-        azimuth = np.arctan2(directions[:, 1], directions[:, 0])
-        ring = np.sin(polar)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
-        return self.spline(np.concatenate([ring, np.cos(polar)[:, None]], axis=1))
-
-    def samples(self, local):
-        """(n, k, k) samples with the light's cosine at local directions (n, k, 3)."""
-        n, k, _ = local.shape
-        shares = self.shares(local.reshape(-1, 3)).reshape(n, k, -1)
-        values = np.exp(shares @ self.log @ np.swapaxes(shares, 1, 2))
-        up = local[..., 2]
-        seen = (up > 0)[:, :, None] & (up > 0)[:, None, :]
-        return np.where(seen, values * up[:, None, :], 0.0).astype(np.float32)
+from reflfield.reproduction.measured_felt import Felt, read_felt
 
 
 def leave_one_out(directions, reflectance):
@@ -174,7 +137,7 @@ def main() -> None:
     root = Path(os.environ.get("REFLFIELD_DATA", "../shared/data")) / "ubo2014_felt05"
     if not root.exists():
         raise SystemExit(f"{root} not found: set REFLFIELD_DATA to the folder of the test data")
-    directions, reflectance = measured(root)
+    directions, reflectance = read_felt(root)
     results = Results("felt", "Known rotations of a measured felt", ["reflfield.alignment"])
     print(
         f"spline at a direction left out: {100 * leave_one_out(directions, reflectance):.1f} %"
@@ -186,7 +149,7 @@ def main() -> None:
     local = np.einsum("nij,kj->nki", truth, directions)
     felt = Felt(directions, reflectance)
     blocks = np.array_split(np.arange(options.texels), max(1, options.texels // 64))
-    samples = np.concatenate([felt.samples(local[rows]) for rows in blocks])
+    samples = np.concatenate([felt.samples(local[rows], local[rows]) for rows in blocks])
     samples += options.noise * samples.std() * rng.standard_normal(samples.shape, np.float32)
     align(samples[:2], directions, directions)  # compile before the clock starts
     for name, refine in (

@@ -24,7 +24,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import matplotlib
 import numpy as np
 from benchmarks.measuring import Results
-from benchmarks.synthetic_btf import (
+from matplotlib.colors import LogNorm
+
+from reflfield.alignment import align
+from reflfield.report.plots import SERIES_COLOURS
+from reflfield.reproduction.paper_scene import (
     ashikhmin_shirley,
     dome_directions,
     frame_errors,
@@ -32,10 +36,6 @@ from benchmarks.synthetic_btf import (
     sample_texels,
     with_the_truths_tangents,
 )
-from matplotlib.colors import LogNorm
-
-from reflfield.alignment import align
-from reflfield.report.plots import SERIES_COLOURS
 
 matplotlib.use("Agg")
 from matplotlib import pyplot

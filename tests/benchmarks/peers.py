@@ -9,7 +9,8 @@ from __future__ import annotations
 import importlib.util
 
 import numpy as np
-from alignment.paper_forms import both_signs, complex_coefficients, rotations_zyz
+
+from reflfield.reproduction.paper_forms import both_signs, complex_coefficients, rotations_zyz
 
 
 def missing(name):

@@ -160,6 +160,24 @@ def test_columns_inside_the_basis_add_no_direction(rng, dtype, floor):
 
 @pytest.mark.stability
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_lies_outside_is_orthogonal_however_little_it_is(rng, dtype, bounded):
+    """A ten-thousandth of the columns: one projection leaves ten thousand roundings of it."""
+    basis = np.linalg.qr(rng.standard_normal((200, 6)))[0].astype(dtype)
+    columns = basis @ rng.standard_normal((6, 30)) + 1e-4 * rng.standard_normal((200, 30))
+    rest = outside(basis, columns.astype(dtype)).astype(np.float64)
+    inside = np.linalg.norm(basis.T.astype(np.float64) @ rest, axis=0)
+    bounded.at_most(
+        inside / np.linalg.norm(rest, axis=0),
+        64 * np.finfo(dtype).eps,
+        case="degenerate blocks",
+        quantity="share of a residual inside the basis",
+        source="projected twice: eps of what is left, and of sums of 200 terms",
+        dtype=dtype,
+    )
+
+
+@pytest.mark.stability
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_orthogonality_after_many_blocks(rng, dtype, bounded):
     left = rng.standard_normal((300, 5))
     svd = OnlineSVD(12, dtype)

@@ -31,6 +31,16 @@ def test_smooth_function_of_the_upper_hemisphere_is_recovered():
     assert np.abs(back - samples)[GRID[:, 2] > 0].max() < 0.02
 
 
+def test_synthesis_is_zero_below_the_horizon_and_what_it_was_above():
+    below = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0]])
+    mixed = direction_operator("views", np.concatenate([GRID, below]), 4).synthesis
+    assert not mixed[-2:].any()
+    above = GRID[:, 2] > 0
+    np.testing.assert_array_equal(
+        mixed[:-2][above], direction_operator("views", GRID, 4).synthesis[above]
+    )
+
+
 def test_both_directions_match_one_after_the_other(rng, rounding):
     samples = rng.standard_normal((3, 81, 81))
     projector = Projector(GRID, GRID, (4, 6))

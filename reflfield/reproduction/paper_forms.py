@@ -2,7 +2,7 @@
 
 G. Müller, R. Sarlette, R. Klein, "Data-driven local coordinate systems for image-based
 rendering", Eurographics 2006: equations 3, 5, 8, 10 and 11. The same sums one rotation at a
-time, as plainly as they are written there, stand in `references.py` and check these.
+time, as plainly as they are written there, are what the tests check these by.
 
 Coefficients are real and orthonormal, index ``ell * ell + ell + m``.
 """
@@ -11,14 +11,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba  # without its cache: this file is imported under more than one name
+import numba
 import numpy as np
 import scipy.fft
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from reflfield.alignment.correlation import spectrum
+from reflfield.sphere.coupling import Coupled
 from reflfield.sphere.hemisphere import first_tap, square_from_xyz
 from reflfield.sphere.wigner import block_offsets, degree_tables, fill_wigner_d, rotation_blocks
+
+Array = NDArray[np.float64]
+Reals = NDArray[np.floating]
+Complexes = NDArray[np.complexfloating]
 
 # Rotations of the exact series worked on at once: their Wigner matrices take 0.3 GB at L = 16.
 SERIES_AT_ONCE = 2048
@@ -27,31 +33,32 @@ ROTATIONS_AT_ONCE = 256
 ABRDFS_AT_ONCE = 32
 
 
-def grid_angles(band_limit):
+def grid_angles(band_limit: int) -> tuple[Array, Array]:
     """Alpha (gamma alike) and beta of the (2L)^3 rotations of the paper's grid."""
     count = 2 * band_limit
     return np.pi * np.arange(count) / band_limit, np.pi * (np.arange(count) + 0.5) / count
 
 
-def rotations_zyz(alpha, beta, gamma):
+def rotations_zyz(alpha: Array, beta: Array, gamma: Array) -> Array:
     """(n, 3, 3) rotations Rz(alpha) @ Ry(beta) @ Rz(gamma) of arrays of angles."""
     angles = np.stack([alpha.ravel(), beta.ravel(), gamma.ravel()], axis=1)
-    return Rotation.from_euler("ZYZ", angles).as_matrix()
+    rotations: Array = Rotation.from_euler("ZYZ", angles).as_matrix()
+    return rotations
 
 
-def paper_grid(band_limit):
+def paper_grid(band_limit: int) -> Array:
     """(8 L^3, 3, 3) rotations of the paper's grid: beta slowest, then gamma, then alpha."""
     alpha, beta = grid_angles(band_limit)
     b, c, a = np.meshgrid(beta, alpha, alpha, indexing="ij")
     return rotations_zyz(a, b, c)
 
 
-def parts(n, size):
+def parts(n: int, size: int) -> list[slice]:
     """Slices of 0 .. n."""
     return [slice(first, min(first + size, n)) for first in range(0, n, size)]
 
 
-def degree(ell):
+def degree(ell: int) -> slice:
     """Coefficients of one degree."""
     return slice(ell * ell, (ell + 1) ** 2)
 
@@ -59,7 +66,7 @@ def degree(ell):
 # --- one function of direction (Table 1) ----------------------------------------------------
 
 
-def turned(columns, rotations, dtype="float64"):
+def turned(columns: Reals, rotations: Array, dtype: str = "float64") -> Reals:
     """(n_rotations, L^2, k): the functions in the columns (L^2, k), turned by each rotation."""
     band_limit = round(len(columns) ** 0.5)
     blocks = rotation_blocks(rotations, band_limit, dtype)
@@ -72,7 +79,7 @@ def turned(columns, rotations, dtype="float64"):
     return np.concatenate(parts, axis=1)
 
 
-def direct_correlations(a, b, rotations):
+def direct_correlations(a: Reals, b: Reals, rotations: Array) -> Reals:
     """Eq. 8 as it stands: (n_rotations,) sums over degree and orders; Wigner-D made anew."""
     band_limit = round(len(a) ** 0.5)
     pairs = [np.outer(a[degree(ell)], b[degree(ell)]).ravel() for ell in range(band_limit)]
@@ -84,7 +91,7 @@ def direct_correlations(a, b, rotations):
     return np.concatenate(values)
 
 
-def complex_coefficients(real):
+def complex_coefficients(real: Reals) -> Complexes:
     """Orders m >= 0 of complex harmonics from real ones: (..., L, L), [ell, m]."""
     band_limit = round(real.shape[-1] ** 0.5)
     out = np.zeros(
@@ -98,7 +105,7 @@ def complex_coefficients(real):
     return out
 
 
-def both_signs(half):
+def both_signs(half: Complexes) -> Complexes:
     """Orders -(L-1) .. L-1 from those m >= 0 of a real function."""
     m = np.arange(half.shape[-1] - 1, 0, -1)
     sign = np.where(m % 2, -1.0, 1.0).astype(half.real.dtype)
@@ -106,7 +113,7 @@ def both_signs(half):
     return np.concatenate([negative, half], axis=-1)
 
 
-def separation_kernel(band_limit, dtype="float32"):
+def separation_kernel(band_limit: int, dtype: str = "float32") -> Reals:
     """(L, 2L-1, L, 2L): d^ell_mn(beta) of the paper's grid, [m >= 0, n, ell, beta]."""
     _, beta = grid_angles(band_limit)
     kernel = np.zeros((band_limit, 2 * band_limit - 1, band_limit, len(beta)), dtype)
@@ -123,7 +130,7 @@ def separation_kernel(band_limit, dtype="float32"):
     return kernel
 
 
-def separated_correlations(a, b, kernel, n_threads=1):
+def separated_correlations(a: Reals, b: Reals, kernel: Reals, n_threads: int = 1) -> Reals:
     """Eq. 8 for pairs of functions by separation of variables.
 
     Sums over degree are one matrix product per pair of orders, sums over orders a fast
@@ -153,11 +160,14 @@ def separated_correlations(a, b, kernel, n_threads=1):
     cube = scipy.fft.irfft2(
         orders, (count, count), axes=(2, 3), norm="forward", workers=n_threads
     )
-    return cube.reshape(n, -1)
+    flat: Reals = cube.reshape(n, -1)
+    return flat
 
 
-@numba.njit(nogil=True)
-def sampled_correlations(samples, directions, nodes, side, rotations):
+@numba.njit(cache=True, nogil=True)
+def sampled_correlations(
+    samples: Reals, directions: Array, nodes: Reals, side: int, rotations: Array
+) -> Array:
     """Eq. 5: sum over directions of a(w) b(R^T w), b bilinear on hemisphere nodes, 0 below."""
     out = np.zeros(len(rotations))
     for i in range(len(rotations)):
@@ -183,7 +193,7 @@ def sampled_correlations(samples, directions, nodes, side, rotations):
 # --- ABRDFs (Table 2) -----------------------------------------------------------------------
 
 
-def factors(coefficients, rank):
+def factors(coefficients: Reals, rank: int) -> tuple[Reals, Reals]:
     """Rank-K factors (n, K, L^2) of both directions, the root of the singular value in each."""
     u, s, vt = np.linalg.svd(coefficients, full_matrices=False)
     root = np.sqrt(s[:, :rank, None])
@@ -199,11 +209,13 @@ class TurnedTarget(NamedTuple):
         Parts of the grid, each ready for one matrix product.
     """
 
-    view: list
-    light: list
+    view: list[Reals]
+    light: list[Reals]
 
 
-def turn_target(target, rank, rotations, dtype="float32"):
+def turn_target(
+    target: Reals, rank: int, rotations: Array, dtype: str = "float32"
+) -> TurnedTarget:
     """Prepare a target (L_view^2, L_light^2) for `factored_maxima`, once for all ABRDFs."""
     tables = [
         [
@@ -215,18 +227,19 @@ def turn_target(target, rank, rotations, dtype="float32"):
     return TurnedTarget(*tables)
 
 
-def factored_correlations(view, light, target, part):
+def factored_correlations(view: Reals, light: Reals, target: TurnedTarget, part: int) -> Reals:
     """Eq. 11 for some ABRDFs at one part of the grid: (n, rotations)."""
     sides = []
     for own, table in ((view, target.view[part]), (light, target.light[part])):
         n, rank, size = own.shape
         product = own.reshape(n * rank, size) @ table.reshape(size, -1)
         sides.append(product.reshape(n, rank * rank, -1))
-    np.multiply(*sides, out=sides[0])
-    return sides[0].sum(axis=1)
+    np.multiply(sides[0], sides[1], out=sides[0])
+    total: Reals = sides[0].sum(axis=1)
+    return total
 
 
-def factored_maxima(view, light, target):
+def factored_maxima(view: Reals, light: Reals, target: TurnedTarget) -> NDArray[np.int64]:
     """Index of the highest of the grid's rotations by Eq. 11.
 
     For one target the 2 K^2 correlations of an ABRDF are two matrix products: its factors
@@ -253,12 +266,12 @@ def factored_maxima(view, light, target):
     return index
 
 
-def exact_maxima(source, target, rotations):
+def exact_maxima(source: Coupled, target: Coupled, rotations: Array) -> NDArray[np.int64]:
     """Index of the highest of some rotations by the exact series: no coarse step, no ascent.
 
     Parameters
     ----------
-    source, target : reflfield.sphere.coupling.Coupled
+    source, target : Coupled
         n functions and one.
     """
     series = spectrum(source, target)
@@ -272,7 +285,7 @@ def exact_maxima(source, target, rotations):
     return index
 
 
-def direct_abrdf_correlations(a, b, rotations):
+def direct_abrdf_correlations(a: Reals, b: Reals, rotations: Array) -> Reals:
     """Eq. 10: (n_rotations,) sums of a * (D b D^T), Wigner-D made anew for each rotation."""
     values = [
         np.einsum("rij,ij->r", turned_both(b, rotations[some], str(a.dtype)), a)
@@ -281,7 +294,7 @@ def direct_abrdf_correlations(a, b, rotations):
     return np.concatenate(values)
 
 
-def turned_both(b, rotations, dtype):
+def turned_both(b: Reals, rotations: Array, dtype: str) -> Reals:
     """(n_rotations, L_view^2, L_light^2) coefficients with both directions turned."""
     left = turned(b, rotations, dtype)
     band_limit = round(b.shape[1] ** 0.5)
@@ -293,8 +306,14 @@ def turned_both(b, rotations, dtype):
     return left
 
 
-@numba.njit(nogil=True, fastmath=True)
-def sampled_abrdf_correlations(samples, directions, nodes, side, rotations):
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def sampled_abrdf_correlations(
+    samples: NDArray[np.float32],
+    directions: Array,
+    nodes: NDArray[np.float32],
+    side: int,
+    rotations: Array,
+) -> Array:
     """Eq. 3: sum over views and lights of a(v, l) b(R^T v, R^T l); b is 0 below the horizon.
 
     Parameters
@@ -327,8 +346,15 @@ def sampled_abrdf_correlations(samples, directions, nodes, side, rotations):
     return out
 
 
-@numba.njit(nogil=True)
-def place_all(directions, rotation, side, node, s, t):
+@numba.njit(cache=True, nogil=True)
+def place_all(
+    directions: Array,
+    rotation: Array,
+    side: int,
+    node: NDArray[np.int64],
+    s: NDArray[np.float32],
+    t: NDArray[np.float32],
+) -> None:
     """First node and shares of R^T w for each direction; node -1 below the horizon."""
     for k in range(len(directions)):
         d = rotation.T @ directions[k]

@@ -8,9 +8,14 @@ the alignment and its benchmarks use it.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from reflfield.sphere.rotations import frames_from_normals
 
+Array = NDArray[np.float64]
+
+# Of samples that are computed together.
+TEXELS_AT_ONCE = 128
 RINGS_81 = ((0, 1), (17, 8), (34, 16), (51, 24), (68, 32))
 # Of the dome that the paper's measurements come from, without the offsets of its rings.
 RINGS_151 = (
@@ -19,7 +24,7 @@ RINGS_151 = (
 )  # fmt: skip
 
 
-def dome_directions(rings=RINGS_81):
+def dome_directions(rings: tuple[tuple[float, int], ...] = RINGS_81) -> Array:
     """Directions of a dome: polar angle in degrees and count of each ring."""
     parts = []
     for polar, count in rings:
@@ -38,7 +43,7 @@ def dome_directions(rings=RINGS_81):
     return np.concatenate(parts)
 
 
-def relief_frames(width=124, height=90, slope=0.6):
+def relief_frames(width: int = 124, height: int = 90, slope: float = 0.6) -> Array:
     """Frames (n, 3, 3) of a raised ring with soft edges and cosine-modulated tangents."""
     x, y = np.meshgrid(np.linspace(-1.4, 1.4, width), np.linspace(-1.0, 1.0, height))
     radius = np.hypot(x, y)
@@ -60,7 +65,14 @@ def relief_frames(width=124, height=90, slope=0.6):
     return frames_from_normals(normal, hint)
 
 
-def ashikhmin_shirley(view, light, nu=8.0, nv=60.0, diffuse=0.2, specular=0.1):
+def ashikhmin_shirley(
+    view: Array,
+    light: Array,
+    nu: float = 8.0,
+    nv: float = 60.0,
+    diffuse: float = 0.2,
+    specular: float = 0.1,
+) -> Array:
     """Reflectance times cosine of local directions; 0 below the horizon."""
     half = view[..., :, None, :] + light[..., None, :, :]
     half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
@@ -71,16 +83,18 @@ def ashikhmin_shirley(view, light, nu=8.0, nv=60.0, diffuse=0.2, specular=0.1):
     fresnel = specular + (1 - specular) * (1 - hk) ** 5
     lobe = np.sqrt((nu + 1) * (nv + 1)) / (8 * np.pi) * hz**power
     gloss = lobe * fresnel / (hk * np.maximum(np.maximum(nl, nv_), 1e-3))
-    base = 28 * diffuse / (23 * np.pi) * (1 - specular)
-    base = base * (1 - (1 - nl / 2) ** 5) * (1 - (1 - nv_ / 2) ** 5)
+    matt = 28 * diffuse / (23 * np.pi) * (1 - specular)
+    base = matt * (1 - (1 - nl / 2) ** 5) * (1 - (1 - nv_ / 2) ** 5)
     return np.where((nl > 0) & (nv_ > 0), (base + gloss) * nl, 0.0)
 
 
-def sample_texels(frames, views, lights, block=128, **material):
+def sample_texels(
+    frames: Array, views: Array, lights: Array, **material: float
+) -> NDArray[np.float32]:
     """(n, n_views, n_lights) float32 samples of texels with the given frames."""
     parts = []
-    for first in range(0, len(frames), block):
-        part = frames[first : first + block]
+    for first in range(0, len(frames), TEXELS_AT_ONCE):
+        part = frames[first : first + TEXELS_AT_ONCE]
         parts.append(
             ashikhmin_shirley(
                 np.einsum("nij,vj->nvi", part, views),
@@ -91,7 +105,7 @@ def sample_texels(frames, views, lights, block=128, **material):
     return np.concatenate(parts)
 
 
-def with_the_truths_tangents(recovered, truth):
+def with_the_truths_tangents(recovered: Array, truth: Array) -> Array:
     """Recovered frames, all turned alike about their normals so that tangents agree on average.
 
     Data determine the mean tangent of a material only up to such a turn, and this
@@ -105,7 +119,7 @@ def with_the_truths_tangents(recovered, truth):
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ folded
 
 
-def frame_errors(recovered, truth, half_turn=True):
+def frame_errors(recovered: Array, truth: Array, half_turn: bool = True) -> tuple[Array, Array]:
     """Angles between normals and between tangents (as axes if `half_turn`), degrees."""
     normal = np.sum(recovered[:, 2] * truth[:, 2], axis=1)
     # Both tangents are compared in the plane of the true normal.
