@@ -48,11 +48,20 @@ def write_web_page(context: Context, folder: Path) -> dict[str, Any]:
         for bookmark in _bookmarks(name, pairs.frames, comparison.comparison_of(context, name))
     ]
     try:
-        write_object_page(folder / FILE, field, context.capture.name, bookmarks)
+        moved = distances_to_hull(context)
+        write_object_page(folder / FILE, field, context.capture.name, bookmarks, moved)
     except InputError as error:
         log.warning("%s: %s", FILE, error)
         (folder / FILE).write_text(too_large_page(context.capture.name), encoding="utf-8")
     return {"photographs": len(bookmarks)}
+
+
+def distances_to_hull(context: Context) -> NDArray[np.floating] | None:
+    """How far each vertex was moved out of the hull; None where the hull stays."""
+    if not context.options.refines_surface:
+        return None
+    hull, surface = results.atlas(context), results.atlas(context.refined)
+    return np.einsum("nd,nd->n", surface.positions - hull.positions, hull.normals)
 
 
 def page_digests(context: Context) -> dict[str, str]:

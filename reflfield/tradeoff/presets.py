@@ -32,7 +32,7 @@ LADDER: dict[str, Settings] = {
     PREVIEW: {
         "hull.resolution": 96,
         "hull.n_triangles": 5_000,
-        "texture.texels_per_pixel": 0.65,
+        "texture.texels_per_pixel": 0.8,
         "texture.largest": 256,
         "indirect.n_components": 2,
         "completion.passes": 1,

@@ -124,6 +124,8 @@ def _compression(counts: WorkCounts, options: PipelineOptions) -> dict[str, floa
 def _clusters(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     """Local PCA on the grid, then the fit to samples where they may be enough."""
     compression = options.compression
+    if counts.one_view:
+        return {"clusters of one view": compression.clusters * counts.n_samples * UNIT}
     components = 1 + compression.components
     work = {
         "clusters": float(compression.clusters),
@@ -156,6 +158,8 @@ def _completion(counts: WorkCounts, options: PipelineOptions) -> dict[str, float
 
 def _alignment(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     alignment = options.alignment
+    if counts.one_view:
+        return {"normals of one view": counts.n_samples * UNIT}
     if not alignment.enabled:
         return {"alignment": 1.0}
     searched = alignment.iterations * (alignment.band_limit / 8) ** 3 * counts.n_texels
@@ -170,6 +174,8 @@ def _alignment(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]
 
 def _resampling(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     rank = options.compression.rank
+    if counts.one_view:
+        return {"fit of one view": counts.n_samples * UNIT}
     some = min(counts.n_texels, options.compression.training_texels)
     return {
         "resampling": 1.0,

@@ -65,6 +65,8 @@ class WorkCounts:
         Whether the base surface is the image plane.
     shades : bool
         Whether light in shadows is fitted.
+    one_view : bool
+        Whether the frames are those of photometric stereo, of one view under known lights.
     """
 
     n_views: int
@@ -85,6 +87,7 @@ class WorkCounts:
     n_fits: int
     is_plane: bool
     shades: bool
+    one_view: bool
 
 
 def planned_context(
@@ -163,6 +166,7 @@ def counts_of(context: Context, share: float | None = None) -> WorkCounts:
         n_fits=_n_fits(context, model),
         is_plane=context.is_plane,
         shades=context.options.indirect.enabled and _factors_shadows(context),
+        one_view=context.photometric,
     )
 
 

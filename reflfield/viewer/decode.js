@@ -94,7 +94,9 @@ function decodedSurface(arrays) {
   const uv = Float32Array.from(
     arrays.uv, (code, i) => code * arrays.uv_box[2] + arrays.uv_box[i % 2]);
   const faces = Uint32Array.from(arrays.faces);
-  return { positions, uv, faces, centre, radius, facing: meanNormal(positions, faces) };
+  // How far it lies outside of the hull, in shares of what full colour stands for.
+  const moved = Float32Array.from(arrays.moved || new Int8Array(n), (code) => code / 127);
+  return { positions, uv, faces, moved, centre, radius, facing: meanNormal(positions, faces) };
 }
 
 // Sum of the faces' area vectors over the sum of their areas: 0 of a closed surface, a unit

@@ -17,6 +17,9 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from reflfield.capture.cameras import Camera
 from reflfield.capture.lights import DIRECTIONAL, POINT, UNKNOWN, Light
 from reflfield.errors import InputError
@@ -77,6 +80,7 @@ def write_object_page(
     field: ReflectanceField,
     name: str = "",
     bookmarks: Sequence[Bookmark] = (),
+    moved: NDArray[np.floating] | None = None,
 ) -> None:
     """Write the page; it appears when it is whole.
 
@@ -89,13 +93,15 @@ def write_object_page(
         Of the object; that of the field's capture by default.
     bookmarks : sequence of Bookmark
         Photographs to compare with.
+    moved : (n_vertices,) float, optional
+        How far the surface lies outside of the hull that it was made from.
 
     Raises
     ------
     InputError
         If the page would be larger than `MOST_BYTES`.
     """
-    text = object_page(field, name, bookmarks)
+    text = object_page(field, name, bookmarks, moved=moved)
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as partial:
@@ -107,6 +113,7 @@ def object_page(
     name: str = "",
     bookmarks: Sequence[Bookmark] = (),
     most_bytes: int = MOST_BYTES,
+    moved: NDArray[np.floating] | None = None,
 ) -> str:
     """The page as HTML text; same content, same text.
 
@@ -119,13 +126,15 @@ def object_page(
         Photographs to compare with.
     most_bytes : int
         Of the page.
+    moved : (n_vertices,) float, optional
+        See `write_object_page`.
 
     Raises
     ------
     InputError
         If the page would be larger.
     """
-    asset = page_asset(field)
+    asset = page_asset(field, moved)
     script = '"use strict";\n(() => {\n' + "\n".join(map(_file, SCRIPTS)) + "})();\n"
     style = _file("page.css")
     blocks = [base64.b64encode(block.content).decode("ascii") for block in asset.blocks]

@@ -31,6 +31,8 @@ PREVIEW_SIDE = 256
 # Steps of the table of indirect light from 0 to the largest value of a function.
 TABLE_STEPS = 511
 PREVIEW_PERCENTILE = 99.0
+# Of the distances between hull and surface, that full colour stands for, and codes up to it.
+MOVED_PERCENTILE, MOVED_STEPS = 95.0, 127
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,16 @@ class PageAsset:
     blocks: tuple[PackedBlock, ...]
 
 
-def page_asset(field: ReflectanceField) -> PageAsset:
+def page_asset(
+    field: ReflectanceField, moved: NDArray[np.floating] | None = None
+) -> PageAsset:
     """Header and packed arrays of a field.
 
     Parameters
     ----------
     field : ReflectanceField
+    moved : (n_vertices,) float, optional
+        How far the surface lies outside of the hull that it was made from.
 
     Returns
     -------
@@ -74,6 +80,10 @@ def page_asset(field: ReflectanceField) -> PageAsset:
     """
     first: dict[str, NDArray[Any]] = {name: field.arrays[name] for name in FIRST_ARRAYS}
     first["preview"] = texel_image(field, -(-max(field.texel_of_pixel.shape) // PREVIEW_SIDE))
+    mesh = Mesh(field.positions, field.faces)
+    shown = {}
+    if moved is not None:
+        first["moved"], shown["moved"] = _moved_codes(moved, mesh.diagonal)
     rest = {n: field.arrays[n] for n in SCHEMAS[field.model] if n not in FIRST_ARRAYS}
     rest = {name: array for name, array in rest.items() if name not in INDIRECT_ARRAYS}
     has_indirect = field.visibility == "factored" and not field.indirect.is_black
@@ -82,7 +92,7 @@ def page_asset(field: ReflectanceField) -> PageAsset:
     if field.observed_lights is not None and len(field.observed_lights):
         rest["light_covered"] = _light_covered(field.observed_lights)
     blocks = packed_block(first), packed_block(rest)
-    header = _header(field, has_indirect) | {
+    header = _header(field, mesh, has_indirect) | shown | {
         "blocks": [{"bytes": block.size, "arrays": list(block.entries)} for block in blocks]
     }
     return PageAsset(header, blocks)
@@ -140,8 +150,16 @@ def _packings(array: NDArray[Any]) -> Iterator[tuple[bytes, dict[str, Any]]]:
         yield (whole.T if planes else whole).tobytes(), {"delta": delta, "planes": planes}
 
 
-def _header(field: ReflectanceField, has_indirect: bool) -> dict[str, Any]:
-    mesh = Mesh(field.positions, field.faces)
+def _moved_codes(
+    moved: NDArray[np.floating], size: float
+) -> tuple[NDArray[np.int8], dict[str, float]]:
+    """Distances over that of full colour, and the share of the size that this one is."""
+    full = float(np.percentile(np.abs(moved), MOVED_PERCENTILE)) or float(np.abs(moved).max())
+    shares = np.clip(moved / (full or 1.0), -1.0, 1.0)
+    return np.rint(shares * MOVED_STEPS).astype(np.int8), {"share_of_size": full / size}
+
+
+def _header(field: ReflectanceField, mesh: Mesh, has_indirect: bool) -> dict[str, Any]:
     sides = [field.view_side, field.light_side] if isinstance(field, ClusteredField) else [0, 0]
     return {
         "format": FORMAT,

@@ -1,7 +1,7 @@
 // Draws the object: passes of a few lamps each, which add up in a target of floats.
 
 const MOST_LAMPS = 4;  // lamps of one pass, with a shadow map each
-const SHOWS = ["picture", "normals", "tangents", "weights", "coverage"];
+const SHOWS = ["picture", "normals", "tangents", "weights", "coverage", "moved"];
 // Where the rays of a pixel go: a grid of 4 x 4 cells as in render.camera_rays, in an order in
 // which the first few are spread already.
 const RAYS_ORDER = [0, 10, 2, 8, 5, 15, 7, 13, 1, 11, 3, 9, 4, 14, 6, 12];
@@ -40,7 +40,7 @@ class Painter {
     this.nIndices = surface.faces.length;
     this.mesh = gl.createVertexArray();
     gl.bindVertexArray(this.mesh);
-    [[surface.positions, 3], [surface.uv, 2]].forEach(([values, size], place) => {
+    [[surface.positions, 3], [surface.uv, 2], [surface.moved, 1]].forEach(([values, size], place) => {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
       gl.enableVertexAttribArray(place);

@@ -137,6 +137,7 @@ class Panel {
     for (const row of document.querySelectorAll(".photo-only")) row.hidden = scene.photo === null;
     const coverage = element("show").querySelector("[value=coverage]");
     coverage.disabled = !header.known_light || Boolean(field && !field.lightCovered);
+    element("show").querySelector("[value=moved]").disabled = !header.moved;
     this.hint();
   }
 
@@ -149,6 +150,8 @@ class Panel {
         ? "Weights of the first three lobes as red, green and blue."
         : "First three coefficients as red, green and blue about grey.",
       coverage: "Grey: a light stands between lights of the capture. Orange: beyond them, where the capture says nothing.",
+      moved: header.moved && "Blue: the surface lies inside of the hull of the silhouettes, red: outside. Full colour: " +
+        `${Number((100 * header.moved.share_of_size).toPrecision(2))} % of the object's size.`,
     };
     let text = words[scene.show] || "";
     if (scene.photo !== null && !text) text = bookmarks[scene.photo].note;

@@ -9,13 +9,16 @@
 const VERTEX = `#version 300 es
 layout(location = 0) in vec3 a_position;
 layout(location = 1) in vec2 a_uv;
+layout(location = 2) in float a_moved;
 uniform mat4 u_clip;
 out vec3 v_position;
 out vec2 v_uv;
+out float v_moved;
 invariant gl_Position;
 void main() {
   v_position = a_position;
   v_uv = a_uv;
+  v_moved = a_moved;
   gl_Position = u_clip * vec4(a_position, 1.0);
 }`;
 
@@ -165,6 +168,7 @@ vec3 from_domain(vec3 root) {
 const SHADING = `
 in vec3 v_position;
 in vec2 v_uv;
+in float v_moved;
 out vec4 o_colour;
 uniform sampler2D u_frames;          // quaternions, 0 where a pixel has no texel
 uniform sampler2DArrayShadow u_shadows;
@@ -253,7 +257,14 @@ vec3 light_coverage(vec3 normal) {
   return colour;
 }
 
-vec3 shown_value(vec3 normal) {
+// Blue where the surface lies inside of the hull, red where outside, lit from the viewer.
+vec3 distance_to_hull(vec3 normal, vec3 view) {
+  vec3 end = v_moved < 0.0 ? vec3(0.13, 0.4, 0.67) : vec3(0.7, 0.09, 0.17);
+  return mix(vec3(0.93), end, abs(v_moved)) * (0.35 + 0.65 * dot(normal, view));
+}
+
+vec3 shown_value(vec3 normal, vec3 view) {
+  if (u_show == 5) return distance_to_hull(normal, view);
   vec3 total = vec3(0.0);
   for (int j = 0; j < 4; j++) {
     if (tap_weight[j] == 0.0) continue;
@@ -280,7 +291,7 @@ void main() {
   find_taps(clamp(1.0 - pixel, u_least_transition, 1.0));
   vec3 total = vec3(0.0);
   if (u_show > 0) {
-    total = shown_value(normal);
+    total = shown_value(normal, view);
   } else {
     for (int i = 0; i < u_n_lamps; i++) total += lit_by(i, normal, view);
   }

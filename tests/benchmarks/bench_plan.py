@@ -83,7 +83,7 @@ RUNS = {
     "dinoSparseRing": Planned("views=2", folder="middlebury_sparse_rings/dinoSparseRing"),
 }
 # Results of `bench_captures` with default options, or those of the demo.
-TABLES = ("mitsuba_spot", "rti_loewenkopf", "dinoSparseRing")
+TABLES = ("mitsuba_spot", "dinoSparseRing")
 
 
 def command(module, *words):

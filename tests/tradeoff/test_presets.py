@@ -78,6 +78,15 @@ def test_a_preview_by_clusters_is_fitted_once(product):
     assert preset_settings("best", one_light) == preset_settings("best")
 
 
+def test_a_preview_of_one_view_has_few_nodes(product):
+    of_first = tuple(p for p in product.photographs if p.camera == 0)
+    one_view = replace(product, photographs=of_first, base_geometry="plane").subset([0])
+    settings = preset_settings("preview", one_view)
+    assert settings["compression.fit"] == "grid"
+    # Ten lights have a grid of five nodes along a side, of which none is taken away.
+    assert "resampling.light_side" not in settings
+
+
 def test_a_preview_of_a_dome_asks_for_no_clusters(product):
     settings = preset_settings("preview", product)
     assert "compression.fit" not in settings

@@ -167,6 +167,20 @@ class TestPanel:
             settled(page)
         assert page.locator("#hint").is_hidden()
 
+    def test_surface_against_hull(self, page, open_page):
+        """Of a run that moved it: one side moved out is red, one moved in is blue."""
+        assert page.locator("#show option[value=moved]").is_disabled()
+        field = half_vector_field()
+        moved = np.where(field.positions[:, 2] > field.positions[:, 2].mean(), 0.01, -0.02)
+        html = object_page(field, "two spheres", moved=moved)
+        opened = open_page(html, "show=moved&backdrop=dark", size=(300, 300))
+        settled(opened)
+        assert "Full colour:" in opened.locator("#hint").text_content()
+        shown = np.array(Image.open(io.BytesIO(opened.screenshot())).convert("RGB"), int)
+        red, blue = (shown[..., a] - shown[..., b] > 60 for a, b in ((0, 2), (2, 0)))
+        assert min(red.sum(), blue.sum()) > 500
+        assert np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean() - 20
+
     def test_photograph_beside_the_rendering(self, page):
         page.locator("#photo").select_option("0")
         settled(page)
