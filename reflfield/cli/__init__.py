@@ -13,6 +13,7 @@ from reflfield.cli.capture_commands import convert, inspect
 from reflfield.cli.check_command import check
 from reflfield.cli.field_commands import compare, export, relight, view
 from reflfield.cli.lights_command import lights
+from reflfield.cli.masks_command import masks
 from reflfield.cli.reproduce_command import reproduce
 from reflfield.cli.run_commands import demo, run
 from reflfield.cli.tradeoff_commands import plan, tradeoff
@@ -34,8 +35,7 @@ app = typer.Typer(
 # In the order of --help.
 for command in (
     *(demo, run, plan, tradeoff, relight, compare, view, export, inspect, convert, check),
-    lights,
-    reproduce,
+    *(lights, masks, reproduce),
 ):
     app.command()(command)
 LONGEST_MESSAGE = 1600

@@ -63,9 +63,7 @@ class PageAsset:
     blocks: tuple[PackedBlock, ...]
 
 
-def page_asset(
-    field: ReflectanceField, moved: NDArray[np.floating] | None = None
-) -> PageAsset:
+def page_asset(field: ReflectanceField, moved: NDArray[np.floating] | None = None) -> PageAsset:
     """Header and packed arrays of a field.
 
     Parameters
@@ -92,9 +90,11 @@ def page_asset(
     if field.observed_lights is not None and len(field.observed_lights):
         rest["light_covered"] = _light_covered(field.observed_lights)
     blocks = packed_block(first), packed_block(rest)
-    header = _header(field, mesh, has_indirect) | shown | {
-        "blocks": [{"bytes": block.size, "arrays": list(block.entries)} for block in blocks]
-    }
+    header = (
+        _header(field, mesh, has_indirect)
+        | shown
+        | {"blocks": [{"bytes": block.size, "arrays": list(block.entries)} for block in blocks]}
+    )
     return PageAsset(header, blocks)
 
 
