@@ -189,7 +189,7 @@ def table_stages(path, context, counts):
 def factor(predicted, measured):
     """How far a prediction is off: 1 is exact, 2 twice too much, or half."""
     ratio = predicted / measured
-    return max(ratio, 1 / ratio)
+    return max(ratio, 1 / ratio) if ratio > 0 else float("inf")
 
 
 def main():
@@ -231,7 +231,9 @@ def fit(runs, here, options):
     for context, counts, timings in runs.values():
         stages = stage_records(timings)
         # Of a busy machine the wall time of the atlas says nothing.
-        rows += [r for r in measured_rows(context, counts, stages) if r.stage != "atlas"]
+        for row in measured_rows(context, counts, stages):
+            unknown = row.stage in BY_A_PROCESS
+            rows.append(row._replace(cpu=float("nan")) if unknown else row)
     costs = fitted(rows, None, here)
     UNIT_COSTS.write_text(json.dumps(costs.document(), indent=1) + "\n")
 

@@ -217,6 +217,28 @@ def test_steps_find_colours_and_normals_that_were_changed(small_rng):
     assert (step.information > 0).all()
 
 
+def test_where_nothing_is_seen_neighbours_become_more_alike(small_rng):
+    """Priors alone: colours, weights and the bending of normals against the surface's."""
+    model = smooth_model(small_rng)
+    surface = model.frames[:, 2].astype(np.float64)
+    view = pixels_of(small_rng, model)
+    unseen = replace(view, values=np.full_like(view.values, np.nan))
+    change = np.zeros((N_TEXELS, 7))
+    change[:, 4:6] = 0.03 * small_rng.normal(size=(N_TEXELS, 2))
+    uneven = _changed(model, change)
+    graph = graph_of(N_TEXELS)
+    with ThreadPoolExecutor(1) as pool:
+        step = image_step([unseen], uneven, graph, surface, pool).model
+
+    def roughness(values):
+        return float(np.sum(values * (graph.laplacian() @ values)))
+
+    for name in ("diffuse", "weights"):
+        assert roughness(getattr(step, name)) < 0.9 * roughness(getattr(uneven, name))
+    bent = [roughness(one.frames[:, 2] - surface) for one in (uneven, step)]
+    assert bent[1] < 0.9 * bent[0]
+
+
 def test_a_step_does_not_depend_on_the_number_of_threads(small_rng):
     model = smooth_model(small_rng)
     views = [pixels_of(small_rng, model) for _ in range(3)]

@@ -37,6 +37,7 @@ from reflfield.fitting.robust_weights import HUBER, squared_weight
 from reflfield.fitting.tangents import turned_to_long_axes
 from reflfield.fitting.texel_graph import TexelGraph, texel_graph
 from reflfield.fitting.texel_sample_fit import fit_to_samples, solve_coefficients
+from reflfield.sphere.hemisphere import softened_cosine
 from tests.fitting.conftest import frames_about, random_model, unit
 from tests.fitting.test_image_fit import (
     N_TEXELS,
@@ -125,6 +126,25 @@ def test_samples_of_any_directions_are_bounded(bounded):
         quantity="sum of a lobe's weights less 1",
         source="eight products of three: 16 eps",
         **about,
+    )
+
+
+@pytest.mark.parametrize("cosine_light", [0.01, 0.03, 0.2])
+@pytest.mark.parametrize("cosine_view", [0.01, 0.1, 0.9])
+def test_grazing_samples_are_those_of_the_formula(cosine_light, cosine_view, bounded):
+    """Both cosines of V are at least .05, that of the light's own factor is not."""
+    light = np.array([np.sqrt(1 - cosine_light**2), 0, cosine_light], np.float32)
+    view = np.array([0, np.sqrt(1 - cosine_view**2), cosine_view], np.float32)
+    least_light, least_view = (max(c, 0.05) for c in (cosine_light, cosine_view))
+    spread = 1 / (least_light + least_view - least_light * least_view)
+    expected = softened_cosine(np.array(cosine_light)) * (1 + spread)
+    bounded.at_most(
+        np.abs(sample(white(), view, light) / expected - 1),
+        64 * EPS,
+        case="grazing and opposite directions",
+        quantity="relative departure from s (a B + V S T), cosines from .01",
+        source="some dozen roundings of float32: 64 eps",
+        dtype=SINGLE,
     )
 
 
