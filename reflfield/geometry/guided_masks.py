@@ -14,7 +14,7 @@ graph cuts", SIGGRAPH 2004.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -48,6 +48,8 @@ COLOUR_DISTANCE, LIGHTNESS_WEIGHT = 18.0, 0.35
 PLATE_DIFFERENCE = 0.06
 GRABCUT_STEPS = 4
 HULL = HullOptions(resolution=128, n_triangles=20_000)
+# One view in so many may miss a part that photographs alone do not show.
+VIEWS_PER_WRONG = 8
 # Smallest overlap with the hull's outline of a silhouette that needs no second look.
 GOOD_SCORE = 0.9
 
@@ -132,14 +134,17 @@ def guided_masks(
     first = partial(_first_mask, read=read, options=options, plate=plate)
     views = range(len(cameras))
     masks = [first(i) for i in track(views, len(views), "first silhouettes")]
+    # Colours and plates leave too much, photographs alone lose dark parts in some views.
+    alone = plate is None and not options.colours
+    hull = replace(HULL, tolerance=len(cameras) // VIEWS_PER_WRONG) if alone else HULL
     for number in range(options.rounds):
-        outlines = _outlines(cameras, masks)
+        outlines = _outlines(cameras, masks, hull)
         band = BANDS[min(number, len(BANDS) - 1)]
         masks = [
             refined_mask(_encoded(read(i)), outlines[i], masks[i], band)
             for i in track(views, len(views), f"silhouettes by the hull, round {number + 1}")
         ]
-    outlines = _outlines(cameras, masks)
+    outlines = _outlines(cameras, masks, hull)
     return [
         GuidedMask(mask, overlap(mask, outline))
         for mask, outline in zip(masks, outlines, strict=True)
@@ -158,10 +163,12 @@ def overlap(one: Bools, other: Bools) -> float:
     return float(np.count_nonzero(one & other) / union) if union else 1.0
 
 
-def _outlines(cameras: Sequence[Camera], masks: Sequence[Bools]) -> list[Bools]:
+def _outlines(
+    cameras: Sequence[Camera], masks: Sequence[Bools], options: HullOptions
+) -> list[Bools]:
     """What each camera sees of the hull of the silhouettes."""
     coverage = [mask.astype(np.float32) for mask in masks]
-    mesh, _ = visual_hull(cameras, coverage, HULL, made=True)
+    mesh, _ = visual_hull(cameras, coverage, options, made=True)
     scene = RayScene(mesh)
     return [scene.silhouette(camera) for camera in cameras]
 
