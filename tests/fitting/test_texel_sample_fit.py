@@ -174,6 +174,12 @@ def test_a_graph_joins_texels_that_face_the_same_way():
     np.testing.assert_allclose(graph.laplacian() @ np.ones(4), 0)
 
 
+def test_texels_on_both_sides_of_a_sharp_edge_are_no_neighbours():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, -1]])
+    normals = np.array([[0.0, 0, 1], [0, 0, 1], [1, 0, 0]])
+    assert texel_graph(points, normals).pairs.tolist() == [[0, 1]]
+
+
 @pytest.mark.parametrize("photographed", ["each view under a light of its own", "all pairs"])
 def test_samples_keep_their_directions_however_few_pairs_were_photographed(
     small_rng, photographed
