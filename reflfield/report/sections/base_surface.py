@@ -70,18 +70,17 @@ def silhouettes_section(
     -------
     Section
     """
-    rows, shown = [], list[tuple[tuple[float, str], SilhouetteView]]()
+    rows, shown = [], dict[tuple[float, str], Panel]()
     for view in views:
         rows.append(_agreement(view))
-        # Pictures of all views of a large capture would take long, and memory.
-        shown.append(((rows[-1][1], view.name), view))
-        shown = sorted(shown, key=lambda entry: entry[0])[:max_pictures]
+        # Pictures of all views of a large capture would take long, photographs memory.
+        place = (rows[-1][1], view.name)
+        if len(shown) < max_pictures or place < max(shown):
+            shown[place] = Panel(_overlay(view), f"{view.name} · IoU {place[0]:.3f}")
+            shown = dict(sorted(shown.items())[:max_pictures])
     rows.sort(key=lambda row: (row[1], row[0]))
-    panels = tuple(
-        Panel(_overlay(view), f"{name} · IoU {overlap:.3f}") for (overlap, name), view in shown
-    )
     figure = Figure(
-        panels,
+        tuple(shown.values()),
         "Views with the lowest IoU come first. The two outlines should coincide. Red areas "
         "were carved away although the photograph shows the object there (a wrong camera "
         "pose, or a silhouette that is too small in another view); yellow areas are hull "
