@@ -50,8 +50,8 @@ exclude 71 % of its own); check its camera and its silhouette'
         """
         text = (
             f"{printable(self.view)}: its silhouette contradicts the {n_others} others (it "
-            f"excludes {100 * self.excluded:.0f} % of their area, they exclude "
-            f"{100 * self.uncovered:.0f} % of its own)"
+            f"excludes {_percent(self.excluded)} % of their area, they exclude "
+            f"{_percent(self.uncovered)} % of its own)"
         )
         why = self.explanation
         if why is None:
@@ -60,6 +60,11 @@ exclude 71 % of its own); check its camera and its silhouette'
             f"{text}; {why.words}, it seems: so read, it overlaps their hull by "
             f"{why.after:.2f} instead of {why.before:.2f}"
         )
+
+
+def _percent(share: float) -> str:
+    """Percent, with a decimal where there are few."""
+    return f"{100 * share:.{0 if share >= 0.1 else 1}f}"
 
 
 @dataclass(frozen=True, eq=False)
