@@ -9,6 +9,7 @@ import typer
 
 from reflfield.cli.limits import working
 from reflfield.cli.shared_options import (
+    CapturePath,
     EncodingOption,
     FollowLinks,
     Format,
@@ -47,7 +48,7 @@ def inspect(
 
 
 def convert(
-    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    capture: CapturePath,
     out: Out,
     to: Annotated[
         str, typer.Option(metavar="native|transforms|colmap", help="Format to write.")

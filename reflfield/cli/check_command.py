@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from reflfield.cli.limits import NOTHING_LEFT
-from reflfield.cli.shared_options import EncodingOption, FollowLinks, Format, LayerOption, Out
+from reflfield.cli.shared_options import (
+    CapturePath,
+    EncodingOption,
+    FollowLinks,
+    Format,
+    LayerOption,
+    Out,
+)
 from reflfield.util.terminal import say, showing_progress
 
 # Exit status by the severity of the gravest finding.
@@ -19,7 +24,7 @@ MOST_SAID = 5
 
 
 def check(
-    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    capture: CapturePath,
     out: Out,
     format: Format = None,
     follow_links: FollowLinks = False,

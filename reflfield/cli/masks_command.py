@@ -8,12 +8,19 @@ from typing import Annotated
 import typer
 
 from reflfield.cli.limits import NOTHING_LEFT
-from reflfield.cli.shared_options import EncodingOption, FollowLinks, Format, LayerOption, Out
+from reflfield.cli.shared_options import (
+    CapturePath,
+    EncodingOption,
+    FollowLinks,
+    Format,
+    LayerOption,
+    Out,
+)
 from reflfield.util.terminal import say, showing_progress
 
 
 def masks(
-    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    capture: CapturePath,
     out: Out,
     backdrop: Annotated[
         list[str] | None,

@@ -11,12 +11,17 @@ import typer
 from reflfield.cli.limits import GOES_ON, limits, n_workers, working
 from reflfield.cli.messages import say_results
 from reflfield.cli.shared_options import (
+    CapturePath,
+    Config,
     EncodingOption,
     FollowLinks,
     Format,
+    HoldOutWords,
     LayerOption,
     MaxMemory,
     Out,
+    Preset,
+    Settings,
     Workers,
 )
 
@@ -35,21 +40,11 @@ def demo(
 
 
 def run(
-    capture: Annotated[Path, typer.Argument(help="Folder or description file of a capture.")],
+    capture: CapturePath,
     out: Out,
-    config: Annotated[Path | None, typer.Option(help="Options in TOML.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="stage.option=value", help="One option; repeatable."),
-    ] = None,
-    hold_out: Annotated[
-        str,
-        typer.Option(
-            metavar="views=K,lights=K",
-            help="Kept for comparison; or views=K,light-cone=25deg, or photographs=K, or test: "
-            "the capture's test split.",
-        ),
-    ] = "",
+    config: Config = None,
+    set_: Settings = None,
+    hold_out: HoldOutWords = "",
     size: Annotated[
         str, typer.Option(metavar="2MB", help="Of the field; the best field of that size.")
     ] = "",
@@ -60,13 +55,7 @@ def run(
             help="Of the field; the smallest that is as good. Status 3 if none is.",
         ),
     ] = None,
-    preset: Annotated[
-        str,
-        typer.Option(
-            metavar="preview|standard|best",
-            help="Options from measured fronts; --config and --set change them.",
-        ),
-    ] = "standard",
+    preset: Preset = "standard",
     budget: Annotated[
         str,
         typer.Option(

@@ -45,3 +45,24 @@ LayerOption = Annotated[
 Workers = Annotated[int, typer.Option(help="Threads; 0 takes one per core.")]
 MaxMemory = Annotated[str, typer.Option(help="Ceiling of resident memory.")]
 RaysPerPixel = Annotated[int, typer.Option(help="A square number.")]
+CapturePath = Annotated[Path, typer.Argument(help="Folder or description file of a capture.")]
+Config = Annotated[Path | None, typer.Option(help="Options in TOML.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="stage.option=value", help="One option; repeatable."),
+]
+Preset = Annotated[
+    str,
+    typer.Option(
+        metavar="preview|standard|best",
+        help="Options from measured fronts; --config and --set change them.",
+    ),
+]
+HoldOutWords = Annotated[
+    str,
+    typer.Option(
+        metavar="views=K,lights=K",
+        help="Kept for comparison; or views=K,light-cone=25deg, or photographs=K, or test: "
+        "the capture's test split.",
+    ),
+]

@@ -9,34 +9,24 @@ import typer
 
 from reflfield.cli.limits import GOES_ON, limits, working
 from reflfield.cli.shared_options import (
+    CapturePath,
+    Config,
     EncodingOption,
     FollowLinks,
     Format,
+    HoldOutWords,
     LayerOption,
     MaxMemory,
     Out,
+    Preset,
+    Settings,
     Workers,
 )
 from reflfield.util.terminal import say
 
-CaptureArgument = Annotated[
-    Path, typer.Argument(help="Folder or description file of a capture.")
-]
-Config = Annotated[Path | None, typer.Option(help="Options in TOML.")]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="stage.option=value", help="One option; repeatable."),
-]
-Preset = Annotated[
-    str, typer.Option(metavar="preview|standard|best", help="Options from measured fronts.")
-]
-HoldOutWords = Annotated[
-    str, typer.Option(metavar="views=K,lights=K", help="Kept for comparison, as of run.")
-]
-
 
 def plan(
-    capture: CaptureArgument,
+    capture: CapturePath,
     config: Config = None,
     set_: Settings = None,
     preset: Preset = "standard",
@@ -66,7 +56,7 @@ def plan(
 
 
 def tradeoff(
-    capture: CaptureArgument,
+    capture: CapturePath,
     out: Out,
     budget: Annotated[
         str, typer.Option(metavar="20min", help="Time for all runs; without, all are made.")
