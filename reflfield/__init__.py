@@ -40,6 +40,7 @@ from typing import Any as _Any
 if _TYPE_CHECKING:
     from reflfield.alignment.align_texels import Alignment, align
     from reflfield.alignment.refinement import RefinementOptions
+    from reflfield.api.capture_calibration import Calibration, calibrate
     from reflfield.api.captures import describe_capture, open_capture
     from reflfield.api.example import example_field
     from reflfield.api.fields import Field, open_field
@@ -87,6 +88,7 @@ __all__ = [
     "Alignment",
     "AlignmentOptions",
     "AtlasOptions",
+    "Calibration",
     "Camera",
     "Capture",
     "CaptureError",
@@ -118,6 +120,7 @@ __all__ = [
     "TextureOptions",
     "VisibilityOptions",
     "align",
+    "calibrate",
     "compare",
     "complete",
     "convert_btf",
@@ -140,6 +143,7 @@ _MODULES = {
     "reflfield.capture.conversion": ("convert_btf", "convert_capture"),
     "reflfield.alignment.align_texels": ("Alignment", "align"),
     "reflfield.alignment.refinement": ("RefinementOptions",),
+    "reflfield.api.capture_calibration": ("Calibration", "calibrate"),
     "reflfield.api.captures": ("describe_capture", "open_capture"),
     "reflfield.api.example": ("example_field",),
     "reflfield.api.fields": ("Field", "open_field"),

@@ -62,7 +62,7 @@ def convert_capture(
     if to not in TARGETS:
         raise InputError(f"to: expected {', '.join(TARGETS)}, received {to!r}")
     out = Path(out)
-    _check_empty(out)
+    check_empty(out)
     with filling(out) as partial:
         files = WrittenFiles(partial, link_file if link else shutil.copyfile)
         TARGETS[to](capture, files)
@@ -85,11 +85,17 @@ def convert_btf(path: Path | str, out: Path | str) -> int:
         If the folder is not empty, or the container cannot be read.
     """
     path, out = Path(path), Path(out)
-    _check_empty(out)
+    check_empty(out)
     btf = read_btf_means(path) if path.is_dir() else read_btf(path)
     return write_btf_samples(btf, out, printable(path.stem) or "btf")
 
 
-def _check_empty(out: Path) -> None:
+def check_empty(out: Path) -> None:
+    """Refuse a folder that holds something.
+
+    Raises
+    ------
+    InputError
+    """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: expected a new or empty folder, received {out}; choose another")

@@ -9,6 +9,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from reflfield import __version__
+from reflfield.cli.calibrate_command import calibrate
 from reflfield.cli.capture_commands import convert, inspect
 from reflfield.cli.check_command import check
 from reflfield.cli.field_commands import compare, export, relight, view
@@ -35,7 +36,7 @@ app = typer.Typer(
 # In the order of --help.
 for command in (
     *(demo, run, plan, tradeoff, relight, compare, view, export, inspect, convert, check),
-    *(lights, masks, reproduce),
+    *(lights, masks, calibrate, reproduce),
 ):
     app.command()(command)
 LONGEST_MESSAGE = 1600
