@@ -173,7 +173,7 @@ def writers_at_once(context: Context) -> int:
 IMAGE_BYTES = 64
 # A pixel of a photograph beside it: as stored, linear, what of it is measured; the image
 # read again, silhouette and masks.
-COMPARED_BYTES = 96
+COMPARED_BYTES = 24
 # A pixel of a turntable's frame, all of which are kept: half floats, encoded, animated.
 FRAME_BYTES = 13
 # A pixel of an environment map while it is read.
