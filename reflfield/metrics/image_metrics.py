@@ -242,6 +242,7 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     for photograph, silhouette in pictures:
         n_frames += 1
         meter.add(photograph, silhouette)
+        del photograph, silhouette  # before the next ones are read
     if meter.is_empty:
         raise NothingToMeasure(
             "frames: expected at least one object pixel to set the exposure from, received "
@@ -287,7 +288,7 @@ def compare_images(frames: Iterable[ImagePair], exposure: float | None = None) -
     """
     pairs = list(frames) if isinstance(frames, Iterator) else frames
     if exposure is None:
-        exposure = common_exposure((p.photograph, p.counted) for p in _checked(pairs))
+        exposure = common_exposure(_checked(pairs))
     notes: tuple[str, ...] = ()
     if math.isnan(exposure):
         exposure = 1.0
@@ -298,6 +299,7 @@ def compare_images(frames: Iterable[ImagePair], exposure: float | None = None) -
             measured.append(measure_image(pair, exposure))
         else:
             left_out.append(pair.name)
+        del pair  # before the next one is read
     if not measured:
         raise NothingToMeasure(
             "frames: expected at least one photograph with object pixels to compare, "
@@ -422,10 +424,12 @@ def without_backdrop(pair: ImagePair, rows: slice = slice(None)) -> tuple[Image,
     return photograph, relit
 
 
-def _checked(pairs: Iterable[ImagePair]) -> Iterator[ImagePair]:
+def _checked(pairs: Iterable[ImagePair]) -> Iterator[tuple[ArrayLike, NDArray[np.bool_]]]:
+    """Photographs and their pixels that count, one at a time in memory."""
     for pair in pairs:
         check_pair(pair)
-        yield pair
+        yield pair.photograph, pair.counted
+        del pair  # before the next one is read
 
 
 def _check_finite(

@@ -71,11 +71,18 @@ def held_out_section(
         If the pairs are not those of the comparison.
     """
     shown = {id(f) for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
-    rows = [
-        compared_row(pair, metrics, comparison.exposure)
-        for pair, metrics in zip(pairs, comparison.frames, strict=True)
-        if id(metrics) in shown
-    ]
+    rows, measured = [], iter(comparison.frames)
+    for pair in pairs:
+        metrics = next(measured, None)
+        if metrics is None or pair.name != metrics.name:
+            raise InputError(
+                f"pairs: expected {metrics.name if metrics else 'no more'!r} as in the "
+                f"comparison, received {pair.name!r}; pass the pairs that were compared, in "
+                "the same order"
+            )
+        if id(metrics) in shown:
+            rows.append(compared_row(pair, metrics, comparison.exposure))
+        del pair  # before the next one is read
     rows.sort(key=lambda row: (-row.metrics.flip, row.metrics.name))
     high = flip_scale([row.error for row in rows])
     items: list[Item] = [_notes_on(comparison)]
@@ -98,11 +105,6 @@ class ComparedRow:
 
 def compared_row(pair: ImagePair, metrics: ImageMetrics, exposure: float) -> ComparedRow:
     """Crop photograph and image to the object and compute their FLIP errors."""
-    if pair.name != metrics.name:
-        raise InputError(
-            f"pairs: expected {metrics.name!r} as in the comparison, received "
-            f"{pair.name!r}; pass the pairs that were compared, in the same order"
-        )
     box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
     photograph, relit = (
         encode_picture(pictures.fitted(encoded_picture(image[box], exposure), ROW_PX))
