@@ -9,6 +9,7 @@ from typing import Any
 
 from reflfield.api.captures import open_capture
 from reflfield.calibration.camera_correction import CameraCorrection, correct_cameras
+from reflfield.calibration.light_correction import LightCorrection, correct_lights
 from reflfield.capture.capture import Capture
 from reflfield.capture.conversion import check_empty, convert_capture
 from reflfield.errors import InputError
@@ -26,18 +27,24 @@ class Calibration:
     capture : Capture
     cameras : CameraCorrection, optional
         Where cameras were to be corrected.
+    lights : LightCorrection, optional
+        Where lights were.
     """
 
     capture: Capture
     cameras: CameraCorrection | None
+    lights: LightCorrection | None
 
     def lines(self) -> list[str]:
         """What was changed and gained, in words."""
-        return [] if self.cameras is None else self.cameras.lines()
+        return [line for part in (self.cameras, self.lights) if part for line in part.lines()]
 
     def entry(self) -> dict[str, Any]:
         """The same for a JSON file."""
-        return {"cameras": None if self.cameras is None else self.cameras.entry()}
+        return {
+            "cameras": None if self.cameras is None else self.cameras.entry(),
+            "lights": None if self.lights is None else self.lights.entry(),
+        }
 
 
 def calibrate(
@@ -45,6 +52,7 @@ def calibrate(
     out: Path | str,
     *,
     cameras: bool = False,
+    lights: bool = False,
     link: bool = False,
     format: str | None = None,
     encoding: str | None = None,
@@ -60,6 +68,8 @@ def calibrate(
         A folder that is new or empty; gets the capture and ``calibration.json``.
     cameras : bool
         Correct the poses of the cameras by the silhouettes.
+    lights : bool
+        Correct the positions of the lights by the photographs, with cameras as corrected.
     link : bool
         Hard links in place of copies of the photographs, where the file system has them.
     format, encoding, layer, follow_links
@@ -73,10 +83,10 @@ def calibrate(
     GeometryError
         If a silhouette cannot be used.
     """
-    if not cameras:
+    if not (cameras or lights):
         raise InputError(
-            "calibrate: expected what to correct (cameras, --cameras of the command), received "
-            "nothing"
+            "calibrate: expected what to correct (cameras, lights; --cameras, --lights of the "
+            "command), received nothing"
         )
     if not isinstance(capture, Capture):
         capture = open_capture(
@@ -84,9 +94,14 @@ def calibrate(
         )
     out = Path(out)
     check_empty(out)
-    of_cameras = correct_cameras(capture)
-    calibration = Calibration(replace(capture, cameras=of_cameras.cameras), of_cameras)
-    convert_capture(calibration.capture, out, link=link)
+    of_cameras = correct_cameras(capture) if cameras else None
+    if of_cameras is not None:
+        capture = replace(capture, cameras=of_cameras.cameras)
+    of_lights = correct_lights(capture) if lights else None
+    if of_lights is not None:
+        capture = replace(capture, lights=of_lights.lights)
+    calibration = Calibration(capture, of_cameras, of_lights)
+    convert_capture(capture, out, link=link)
     with replacing(out / REPORT) as partial:
         partial.write_text(json.dumps(calibration.entry(), indent=1) + "\n")
     return calibration

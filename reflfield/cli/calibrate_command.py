@@ -18,6 +18,9 @@ def calibrate(
     cameras: Annotated[
         bool, typer.Option("--cameras", help="Correct poses of cameras by silhouettes.")
     ] = False,
+    lights: Annotated[
+        bool, typer.Option("--lights", help="Correct places of lights by a matt surface.")
+    ] = False,
     link: Annotated[
         bool, typer.Option("--link", help="Link the photographs instead of copying them.")
     ] = False,
@@ -38,6 +41,7 @@ def calibrate(
             capture,
             out,
             cameras=cameras,
+            lights=lights,
             link=link,
             format=format,
             encoding=encoding,
