@@ -77,9 +77,8 @@ def light_errors(lights, truth):
 def main(folder):
     simulate(folder)
     capture = open_capture(folder)
-    print(
-        "| planted | | position | direction | but for one map | misfit |\n|---|---|---|---|---|---|"
-    )
+    print("| planted | | position | direction | but for one map | misfit |")
+    print("|---|---|---|---|---|---|")
     for millimetres in PLANTED:
         wrong = with_light_errors(capture, millimetres, np.random.default_rng(1))
         correction = correct_lights(wrong)
