@@ -130,7 +130,7 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
             raise InputError(
                 f"{name}: expected at least {FEWEST_PATCHES} patches of the ColorChecker, and "
                 f"{FEWEST_GREYS} of its greys, below the upper limit of the photograph, "
-                f"received {used.sum()} and {greys.sum()}; photograph it with a shorter exposure"
+                f"received {used.sum()} and {greys.sum()}; expose it for less time"
             )
         return _fitted(colour, patches, truth, used, greys)
 
