@@ -47,6 +47,7 @@ FLAGS = {
     "grey_card": "--grey-card",
     "radius": "--radius",
     "focal": "--focal",
+    "color_checker": "--color-checker",
     "view": "--view",
     "mesh": "--on",
     "tiles": "--tile",

@@ -5,12 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from reflfield.api.captures import open_capture
 from reflfield.calibration.camera_correction import CameraCorrection, correct_cameras
+from reflfield.calibration.color_chart import (
+    ColorCorrection,
+    check_installed,
+    color_correction,
+)
+from reflfield.calibration.corrected_photographs import with_colors_corrected
+from reflfield.calibration.light_correction import LightCorrection, correct_lights
 from reflfield.capture.capture import Capture
 from reflfield.capture.conversion import check_empty, convert_capture
+from reflfield.capture.encoding import parse_encoding
+from reflfield.capture.image_files import ImageReading, read_image
 from reflfield.errors import InputError
 from reflfield.util.files import replacing
 
@@ -24,20 +34,31 @@ class Calibration:
     Parameters
     ----------
     capture : Capture
+        As it was written.
     cameras : CameraCorrection, optional
         Where cameras were to be corrected.
+    lights : LightCorrection, optional
+        Where lights were.
+    color : ColorCorrection, optional
+        Where a photograph of a chart was there.
     """
 
     capture: Capture
     cameras: CameraCorrection | None
+    lights: LightCorrection | None
+    color: ColorCorrection | None
 
     def lines(self) -> list[str]:
         """What was changed and gained, in words."""
-        return [] if self.cameras is None else self.cameras.lines()
+        return [line for part in self._parts.values() if part for line in part.lines()]
 
     def entry(self) -> dict[str, Any]:
         """The same for a JSON file."""
-        return {"cameras": None if self.cameras is None else self.cameras.entry()}
+        return {name: part and part.entry() for name, part in self._parts.items()}
+
+    @property
+    def _parts(self) -> dict[str, CameraCorrection | LightCorrection | ColorCorrection | None]:
+        return {"cameras": self.cameras, "color": self.color, "lights": self.lights}
 
 
 def calibrate(
@@ -45,6 +66,8 @@ def calibrate(
     out: Path | str,
     *,
     cameras: bool = False,
+    lights: bool = False,
+    color_checker: Path | None = None,
     link: bool = False,
     format: str | None = None,
     encoding: str | None = None,
@@ -60,6 +83,11 @@ def calibrate(
         A folder that is new or empty; gets the capture and ``calibration.json``.
     cameras : bool
         Correct the poses of the cameras by the silhouettes.
+    lights : bool
+        Correct the positions of the lights by the photographs, with cameras as corrected.
+    color_checker : Path, optional
+        Photograph of a ColorChecker Classic, taken and developed as those of the capture, which
+        are then written anew with its white balance and matrix. Needs the extra ``color``.
     link : bool
         Hard links in place of copies of the photographs, where the file system has them.
     format, encoding, layer, follow_links
@@ -73,10 +101,10 @@ def calibrate(
     GeometryError
         If a silhouette cannot be used.
     """
-    if not cameras:
+    if not (cameras or lights or color_checker):
         raise InputError(
-            "calibrate: expected what to correct (cameras, --cameras of the command), received "
-            "nothing"
+            "calibrate: expected what to correct (cameras, lights, color_checker; of the "
+            "command --cameras, --lights, --color-checker), received nothing"
         )
     if not isinstance(capture, Capture):
         capture = open_capture(
@@ -84,9 +112,25 @@ def calibrate(
         )
     out = Path(out)
     check_empty(out)
-    of_cameras = correct_cameras(capture)
-    calibration = Calibration(replace(capture, cameras=of_cameras.cameras), of_cameras)
-    convert_capture(calibration.capture, out, link=link)
+    of_color = None if color_checker is None else _color(color_checker, encoding, layer)
+    of_cameras = correct_cameras(capture) if cameras else None
+    if of_cameras is not None:
+        capture = replace(capture, cameras=of_cameras.cameras)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.colours") as folder:
+        if of_color is not None and of_color.kind != "none":
+            capture = with_colors_corrected(capture, of_color.matrix, Path(folder))
+        of_lights = correct_lights(capture) if lights else None
+        if of_lights is not None:
+            capture = replace(capture, lights=of_lights.lights)
+        convert_capture(capture, out, link=link)
+    calibration = Calibration(open_capture(out), of_cameras, of_lights, of_color)
     with replacing(out / REPORT) as partial:
         partial.write_text(json.dumps(calibration.entry(), indent=1) + "\n")
     return calibration
+
+
+def _color(path: Path, encoding: str | None, layer: str | None) -> ColorCorrection:
+    check_installed()
+    curve = parse_encoding(encoding) if encoding is not None else None
+    return color_correction(read_image(path, ImageReading(curve, layer)), str(path))

@@ -125,7 +125,7 @@ def correct_cameras(capture: Capture) -> CameraCorrection:
         If a silhouette is empty, or no two views can be compared.
     """
     _check(capture)
-    views, silhouettes = _small_views(capture)
+    views, silhouettes = small_views(capture)
     cameras = [view.camera for view in views]
     poses = np.array([camera.camera_from_world for camera in cameras])
     planes = TangentPlanes.of(convex_outlines(views), poses)
@@ -163,7 +163,7 @@ def _check(capture: Capture) -> None:
         )
 
 
-def _small_views(capture: Capture) -> tuple[list[View], Sequence[Any]]:
+def small_views(capture: Capture) -> tuple[list[View], Sequence[Any]]:
     """Views and their silhouettes, at most `LONGEST_SIDE` along a side, without specks."""
     cameras, silhouettes = [], []
     for number in track(range(capture.n_views), capture.n_views, "reading silhouettes"):

@@ -18,6 +18,16 @@ def calibrate(
     cameras: Annotated[
         bool, typer.Option("--cameras", help="Correct poses of cameras by silhouettes.")
     ] = False,
+    lights: Annotated[
+        bool, typer.Option("--lights", help="Correct places of lights by a matt surface.")
+    ] = False,
+    color_checker: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PHOTOGRAPH",
+            help="Of a ColorChecker, taken as the capture was: white balance and matrix.",
+        ),
+    ] = None,
     link: Annotated[
         bool, typer.Option("--link", help="Link the photographs instead of copying them.")
     ] = False,
@@ -38,6 +48,8 @@ def calibrate(
             capture,
             out,
             cameras=cameras,
+            lights=lights,
+            color_checker=color_checker,
             link=link,
             format=format,
             encoding=encoding,

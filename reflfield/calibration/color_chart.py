@@ -1,0 +1,240 @@
+"""A ColorChecker found in a photograph, and the matrix that gives its patches their colours."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reflfield.errors import InputError
+
+Array = NDArray[np.float64]
+
+# Colours of the patches of charts made since November 2014, under D50.
+CHART = "ColorChecker24 - After November 2014"
+N_PATCHES, NEUTRAL = 24, slice(18, 24)
+# Share of the largest value of the photograph from which on a patch may be clipped, and patches
+# and grey ones that tell a matrix.
+CLIPPED, FEWEST_PATCHES, FEWEST_GREYS = 0.95, 12, 2
+# Ratio of greys from which on a photograph is plainly not linear.
+LINEAR_GREYS = 1.25
+_WORDS = {
+    "matrix": "a matrix",
+    "white balance": "the white balance alone, no matrix is better",
+    "none": "nothing, no correction is better",
+}
+_NEEDED = ("colour", "colour_checker_detection")
+
+
+@dataclass(frozen=True, eq=False)
+class ColorCorrection:
+    """A matrix for linear photographs, and what it gains.
+
+    Parameters
+    ----------
+    matrix : (3, 3) float64
+        From linear photographs to linear values in Rec.709's primaries; it leaves the luminance
+        of greys as it is. Of the whole matrix, the white balance alone and no correction the
+        one of the least error.
+    kind : {"matrix", "white balance", "none"}
+        Which that is.
+    white_balance : (3,) float64
+        Factors of red, green and blue that give greys their colours, of green 1.
+    n_used : int
+        Patches that are not clipped.
+    grey_scatter : float
+        Largest ratio of brightness to reflectance of greys over the least one: 1 where the
+        photograph is linear and the chart evenly lit.
+    error_before, error_balanced, error_after : float
+        Mean difference (CIE DE2000) of these patches, at the best common brightness: as
+        photographed, with the white balance alone, and with matrices fitted without the patch.
+    """
+
+    matrix: Array
+    kind: str
+    white_balance: Array
+    n_used: int
+    grey_scatter: float
+    error_before: float
+    error_balanced: float
+    error_after: float
+
+    def lines(self) -> list[str]:
+        """What was found, in words."""
+        gains = ", ".join(f"{gain:.3f}" for gain in self.white_balance)
+        lines = [
+            f"colour: corrected by {_WORDS[self.kind]}; white balance {gains}, "
+            f"{self.n_used} of {N_PATCHES} patches used",
+            f"difference of the patches (CIE DE2000): {self.error_before:.1f} -> "
+            f"{self.error_balanced:.1f} balanced -> {self.error_after:.1f} by the matrix (each "
+            "patch left out in turn)",
+        ]
+        if self.grey_scatter > LINEAR_GREYS:
+            lines.append(
+                f"the greys are off by {self.grey_scatter:.1f} times among each other: the "
+                "photograph is not linear, or the chart not evenly lit; develop photographs "
+                "without a tone curve, or state their encoding"
+            )
+        return lines
+
+    def entry(self) -> dict[str, Any]:
+        """The same for a JSON file."""
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self).items()
+        }
+
+
+def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrection:
+    """Find a ColorChecker Classic in a photograph and fit a matrix to it.
+
+    Parameters
+    ----------
+    photograph : (height, width, 3) float
+        Linear.
+    name : str
+        Quoted in messages.
+
+    Raises
+    ------
+    InputError
+        If colour-science or colour-checker-detection are not installed, no chart is found, or
+        too much of it is clipped.
+
+    Notes
+    -----
+    The white balance is the mean ratio of the greys; the matrix is of least squares. [1]_
+
+    References
+    ----------
+    .. [1] V. Cheung et al., "A comparative study of the characterisation of colour cameras by
+       means of neural networks and polynomial transforms", Coloration Technology 120, 2004.
+    """
+    check_installed()
+    image = np.asarray(photograph, np.float64)
+    with _libraries() as (colour, detection):
+        patches = _patches(detection, image / max(float(image.max()), 1e-9), name)
+        truth = _reference(colour)
+        used: NDArray[np.bool_] = np.all((patches < CLIPPED) & (patches > 0), axis=1)
+        greys = np.zeros(N_PATCHES, bool)
+        greys[NEUTRAL] = True
+        greys &= used
+        if used.sum() < FEWEST_PATCHES or greys.sum() < FEWEST_GREYS:
+            raise InputError(
+                f"{name}: expected at least {FEWEST_PATCHES} patches of the ColorChecker, and "
+                f"{FEWEST_GREYS} of its greys, below the upper limit of the photograph, "
+                f"received {used.sum()} and {greys.sum()}; expose it for less time"
+            )
+        return _fitted(colour, patches, truth, used, greys)
+
+
+def check_installed() -> None:
+    """Demand the packages of the extra ``color``.
+
+    Raises
+    ------
+    InputError
+    """
+    missing = [name.replace("_", "-") for name in _NEEDED if not find_spec(name)]
+    if missing:
+        raise InputError(
+            f"color_checker: expected the packages that find a chart, found no "
+            f'{", ".join(missing)}; install them with: pip install "reflfield[color]"'
+        )
+
+
+@contextmanager
+def _libraries() -> Iterator[tuple[Any, Any]]:
+    """The packages, imported when they are used; what they lack themselves is not warned of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield import_module("colour"), import_module("colour_checker_detection")
+
+
+def _patches(detection: Any, image: Array, name: str) -> Array:
+    """Linear colours (24, 3) of the chart's patches, of a photograph in [0, 1]."""
+    charts = detection.detect_colour_checkers_segmentation(image.astype(np.float32))
+    if len(charts) == 0:
+        # Its edges are sought in what is as bright as on a screen.
+        shown = np.clip(image, 0, 1) ** (1 / 2.2)
+        charts = detection.detect_colour_checkers_segmentation(shown.astype(np.float32))
+        charts = [np.asarray(chart, np.float64) ** 2.2 for chart in charts]
+    if len(charts) != 1 or np.shape(charts[0]) != (N_PATCHES, 3):
+        raise InputError(
+            f"{name}: expected one ColorChecker Classic of {N_PATCHES} patches, found "
+            f"{len(charts)}; choose a photograph in which it is large, sharp and evenly lit"
+        )
+    return np.asarray(charts[0], np.float64)
+
+
+def _reference(colour: Any) -> Array:
+    """Linear colours (24, 3) of the patches in Rec.709's primaries, adapted to D65."""
+    chart = colour.CCS_COLOURCHECKERS[CHART]
+    tristimulus = colour.xyY_to_XYZ(np.array(list(chart.data.values())))
+    linear: Array = colour.XYZ_to_sRGB(
+        tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False
+    )
+    return linear
+
+
+def _fitted(
+    colour: Any, patches: Array, truth: Array, used: NDArray[np.bool_], greys: NDArray[np.bool_]
+) -> ColorCorrection:
+    ratios = (truth[greys] / patches[greys]).mean(axis=0)
+    balance = ratios / ratios[1]
+    balanced, wanted = (balance * patches)[used], truth[used]
+    scale = _scale(balanced, wanted)
+    fit = colour.characterisation.matrix_colour_correction_Cheung2004
+    matrix = np.asarray(fit(scale * balanced, wanted), np.float64)
+    left_out = np.array(
+        [
+            np.asarray(fit(np.delete(scale * balanced, i, 0), np.delete(wanted, i, 0)))
+            @ (scale * balanced[i])
+            for i in range(len(wanted))
+        ]
+    )
+    errors = {
+        "none": _difference(colour, _scale(patches[used], wanted) * patches[used], wanted),
+        "white balance": _difference(colour, scale * balanced, wanted),
+        "matrix": _difference(colour, left_out, wanted),
+    }
+    kind = min(errors, key=errors.__getitem__)
+    whole = {"none": np.eye(3), "white balance": np.diag(balance), "matrix": matrix * balance}
+    luminance = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
+    grey = patches[greys].mean(axis=0)
+    return ColorCorrection(
+        matrix=whole[kind] * (luminance @ grey) / (luminance @ (whole[kind] @ grey)),
+        kind=kind,
+        white_balance=balance,
+        n_used=int(used.sum()),
+        grey_scatter=_grey_scatter(patches[greys], truth[greys]),
+        error_before=errors["none"],
+        error_balanced=errors["white balance"],
+        error_after=errors["matrix"],
+    )
+
+
+def _grey_scatter(greys: Array, truth: Array) -> float:
+    ratios = greys.mean(axis=1) / truth.mean(axis=1)
+    return float(ratios.max() / ratios.min())
+
+
+def _scale(values: Array, wanted: Array) -> float:
+    """Common factor by which values come nearest to others."""
+    return float((values * wanted).sum() / np.square(values).sum())
+
+
+def _difference(colour: Any, first: Array, second: Array) -> float:
+    """Mean CIE DE2000 of linear colours."""
+    labs = [
+        colour.XYZ_to_Lab(colour.sRGB_to_XYZ(np.clip(c, 0, None), apply_cctf_decoding=False))
+        for c in (first, second)
+    ]
+    return float(np.mean(colour.delta_E(*labs, method="CIE 2000")))

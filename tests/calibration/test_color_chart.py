@@ -1,0 +1,126 @@
+"""A ColorChecker drawn as a camera of known matrix sees it, and what is fitted to it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from reflfield.calibration import color_chart
+from reflfield.calibration.color_chart import color_correction
+from reflfield.calibration.corrected_photographs import with_colors_corrected
+from reflfield.capture.conversion import convert_capture
+from reflfield.capture.image_files import ImageReading, read_image
+from reflfield.capture.image_writing import write_exr
+from reflfield.capture.readers import open_capture
+from reflfield.cli import app
+from reflfield.errors import InputError
+from tests.calibration.planted_poses import simulate
+
+CAMERA_FROM_LINEAR = np.array([[0.40, 0.12, 0.03], [0.06, 0.55, 0.09], [0.02, 0.10, 0.28]])
+
+
+@pytest.fixture
+def chart_photograph():
+    """Function that draws the chart as a camera sees it, linear."""
+    pytest.importorskip("colour_checker_detection", reason="needs the extra color")
+    with color_chart._libraries() as (colour, _):
+        colors = color_chart._reference(colour)
+
+    def draw(camera_from_linear, exposure=1.0):
+        seen = np.maximum(colors @ camera_from_linear.T, 0) * exposure
+        image = np.full((480, 640, 3), 0.25)
+        image[60:420, 50:590] = 0.005
+        for number, color in enumerate(seen):
+            row, column = divmod(number, 6)
+            y, x = 72 + 88 * row, 62 + 88 * column
+            image[y : y + 72, x : x + 72] = color
+        return np.clip(image, 0, 1).astype(np.float32)
+
+    return draw
+
+
+def test_matrix_of_the_camera_is_inverted(chart_photograph):
+    correction = color_correction(chart_photograph(CAMERA_FROM_LINEAR), "chart")
+    assert correction.kind == "matrix"
+    assert correction.grey_scatter < 1.1
+    assert len(correction.lines()) == 2
+    # The patches lie off Rec.709 in one channel of one patch, which is drawn as 0: that, the
+    # samples at edges and single precision are all that is left.
+    total = correction.matrix @ CAMERA_FROM_LINEAR
+    np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=0.03)
+    assert correction.error_after < 1 < correction.error_balanced < correction.error_before
+
+
+def test_clipped_patches_are_left_out(chart_photograph):
+    bright = color_correction(chart_photograph(CAMERA_FROM_LINEAR, 1.8), "chart")
+    assert 12 <= bright.n_used < 24
+    total = bright.matrix @ CAMERA_FROM_LINEAR
+    np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=0.05)
+
+
+def test_photograph_without_chart_is_refused(chart_photograph):
+    with pytest.raises(InputError, match="expected one ColorChecker"):
+        color_correction(np.full((200, 300, 3), 0.3, np.float32), "wall.exr")
+
+
+def test_missing_packages_are_named(monkeypatch):
+    monkeypatch.setattr(color_chart, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r'pip install "reflfield\[color\]"'):
+        color_correction(np.zeros((4, 4, 3)), "chart")
+
+
+@pytest.fixture(scope="session")
+def dome(made_once):
+    return open_capture(made_once("pose-dome", simulate)[0])
+
+
+def test_saturated_pixels_stay_saturated(dome, tmp_path):
+    image = dome.read_photograph(0)
+    image[10:20, 10:20] = [9.0, 0.2, 0.1]
+    write_exr(tmp_path / "a.exr", image)
+    exposure = replace(
+        dome.photographs[0].exposures[0],
+        path=tmp_path / "a.exr",
+        reading=ImageReading(white_level=9.0),
+    )
+    photograph = replace(dome.photographs[0], exposures=(exposure,))
+    one = replace(dome, photographs=(photograph,))
+    corrected = with_colors_corrected(one, np.diag([0.5, 1.0, 2.0]), tmp_path)
+    values, kinds = corrected.read_kinds(0)
+    saturated = np.zeros(image.shape, bool)
+    saturated[10:20, 10:20] = True
+    np.testing.assert_array_equal(kinds == 1, saturated)
+    expected = (image * np.array([0.5, 1.0, 2.0], np.float32))[~saturated]
+    np.testing.assert_allclose(values[~saturated], expected, rtol=1e-6)
+
+
+def test_command(dome, chart_photograph, tmp_path):
+    one = dome.subset(views=[0, 1])
+    convert_capture(one, tmp_path / "capture", link=True)
+    write_exr(tmp_path / "chart.exr", chart_photograph(np.diag([0.8, 0.5, 0.3])))
+    arguments = ["calibrate", str(tmp_path / "capture"), "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*arguments, "--color-checker", str(tmp_path / "chart.exr")])
+    assert done.exit_code == 0, done.output
+    entry = json.loads((tmp_path / "out/calibration.json").read_text())
+    gains = np.array(entry["color"]["white_balance"])
+    np.testing.assert_allclose(gains, [0.5 / 0.8, 1.0, 0.5 / 0.3], rtol=0.01)
+    written = open_capture(tmp_path / "out")
+    matrix = np.array(entry["color"]["matrix"], np.float32)
+    np.testing.assert_allclose(
+        written.read_photograph(1), np.maximum(one.read_photograph(1) @ matrix.T, 0), atol=1e-6
+    )
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["capture", "chart.exr", "out"]
+
+
+def test_chart_of_a_museum(shared_data, tmp_path):
+    pytest.importorskip("colour_checker_detection", reason="needs the extra color")
+    path = shared_data("mia_rodin_metashape") / "colorchecker_231016_miaEURO_9505.jpg"
+    correction = color_correction(read_image(path), path.name)
+    assert correction.n_used >= 12
+    # Developed with a tone curve: nothing linear does much, but the patches are the right ones.
+    assert correction.error_before < 10
+    np.testing.assert_allclose(correction.white_balance, 1.0, atol=0.05)
+    assert correction.grey_scatter > 1.5
+    assert "not linear" in correction.lines()[-1]
