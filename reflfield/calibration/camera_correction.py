@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.calibration.photograph_agreement import photographs_differ
 from reflfield.calibration.pose_adjustment import PoseAdjustment, adjust_poses
 from reflfield.calibration.tangent_planes import TangentPlanes, convex_outlines
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
@@ -30,6 +31,9 @@ LONGEST_SIDE, HULL_VOXELS = 1024, 96
 FEWEST_VIEWS = 5
 # Overlap with the hull that must be gained for corrected poses to be kept.
 LEAST_GAIN = 1e-3
+# Factor by which photographs may differ more for that: their details tell of poses what masks
+# that are drawn badly do not.
+MOST_LOST = 1.05
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,15 @@ class Agreement:
     hull_overlap, least_hull_overlap : float
         Intersection over union of the silhouettes and those of their hull, mean and least of
         all views; 0 where there is no common hull.
+    photographs_differ : float
+        Median difference of the logarithms of luminance of points of the hull from view to
+        view; 0 where there is no common hull.
     """
 
     gap_px: float
     hull_overlap: float
     least_hull_overlap: float
+    photographs_differ: float
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,8 @@ class CameraCorrection:
     before, after : Agreement
         `after` is that of the corrected poses, whether they are kept or not.
     is_kept : bool
-        Whether silhouettes overlap with their hull by `LEAST_GAIN` more than before.
+        Whether silhouettes overlap with their hull by `LEAST_GAIN` more than before, and
+        photographs do not differ by `MOST_LOST` more on it.
     """
 
     cameras: tuple[Camera, ...]
@@ -91,6 +100,8 @@ class CameraCorrection:
             f"outlines: {one.gap_px:.2f} -> {other.gap_px:.2f} pixels apart (rms)",
             f"overlap with the hull: {one.hull_overlap:.4f} -> {other.hull_overlap:.4f} "
             f"(least {one.least_hull_overlap:.4f} -> {other.least_hull_overlap:.4f})",
+            f"photographs differ on the hull by {100 * one.photographs_differ:.2f} -> "
+            f"{100 * other.photographs_differ:.2f} % (median)",
         ]
         if self.is_kept:
             return [
@@ -99,7 +110,12 @@ class CameraCorrection:
                 f"(median {np.median(shifts):.3g})",
                 *lines,
             ]
-        return ["cameras: as described; corrected poses would gain nothing", *lines]
+        why = (
+            "corrected poses would gain nothing"
+            if other.hull_overlap <= one.hull_overlap + LEAST_GAIN
+            else "corrected poses fit silhouettes, but photographs worse; check the masks"
+        )
+        return [f"cameras: as described; {why}", *lines]
 
     def entry(self) -> dict[str, Any]:
         """The same for a JSON file."""
@@ -135,10 +151,13 @@ def correct_cameras(capture: Capture) -> CameraCorrection:
             "received none; correct the poses by other means"
         )
     adjustment = adjust_poses(planes, poses, _distances(cameras))
-    before = _agreement(adjustment.rms_before, cameras, silhouettes)
+    before = _agreement(adjustment.rms_before, cameras, silhouettes, capture)
     corrected = _with_poses(cameras, adjustment)
-    after = _agreement(adjustment.rms_after, corrected, silhouettes)
-    is_kept = after.hull_overlap > before.hull_overlap + LEAST_GAIN
+    after = _agreement(adjustment.rms_after, corrected, silhouettes, capture)
+    is_kept = after.hull_overlap > before.hull_overlap + LEAST_GAIN and (
+        before.hull_overlap == 0
+        or after.photographs_differ <= MOST_LOST * before.photographs_differ
+    )
     return CameraCorrection(
         _with_poses(capture.cameras, adjustment) if is_kept else capture.cameras,
         _moved(cameras, adjustment) if is_kept else (),
@@ -207,12 +226,16 @@ def _moved(cameras: Sequence[Camera], adjustment: PoseAdjustment) -> tuple[Moved
 
 
 def _agreement(
-    gap_px: float, cameras: Sequence[Camera], silhouettes: Sequence[Any]
+    gap_px: float, cameras: Sequence[Camera], silhouettes: Sequence[Any], capture: Capture
 ) -> Agreement:
     # No view is left out: wrong poses shall count.
     options = HullOptions(resolution=HULL_VOXELS, tolerance=0)
     try:
-        overlap = visual_hull(cameras, silhouettes, options)[1].overlap
+        mesh, report = visual_hull(cameras, silhouettes, options)
     except GeometryError:
-        return Agreement(gap_px, 0.0, 0.0)
-    return Agreement(gap_px, float(overlap.mean()), float(overlap.min()))
+        return Agreement(gap_px, 0.0, 0.0, 0.0)
+    overlap = report.overlap
+    poses = zip(capture.cameras, cameras, strict=True)
+    whole = tuple(replace(c, camera_from_world=small.camera_from_world) for c, small in poses)
+    differ = photographs_differ(replace(capture, cameras=whole), mesh)
+    return Agreement(gap_px, float(overlap.mean()), float(overlap.min()), differ)

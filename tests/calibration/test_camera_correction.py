@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from reflfield.api.capture_calibration import calibrate
+from reflfield.calibration import camera_correction
 from reflfield.calibration.camera_correction import correct_cameras
 from reflfield.calibration.pose_adjustment import adjust_poses
 from reflfield.calibration.tangent_planes import TangentPlanes, convex_outlines
@@ -56,6 +57,18 @@ def test_right_poses_are_kept(dome):
     assert not correction.is_kept
     assert correction.before.gap_px < 0.1
     assert "gain nothing" in correction.lines()[0]
+
+
+def test_photographs_outweigh_masks_that_are_drawn_badly(dome, monkeypatch):
+    wrong = with_pose_errors(dome, 0.5, 2.0, np.random.default_rng(5))
+    correction = correct_cameras(wrong)
+    assert correction.is_kept
+    # What the surface shows says the same as the silhouettes, which it does not know.
+    assert correction.after.photographs_differ < 0.5 * correction.before.photographs_differ
+    monkeypatch.setattr(camera_correction, "MOST_LOST", 0.01)
+    refused = correct_cameras(wrong)
+    assert refused.cameras is wrong.cameras
+    assert "photographs worse" in refused.lines()[0]
 
 
 def test_planes_of_right_poses_meet(dome):
