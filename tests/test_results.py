@@ -26,7 +26,7 @@ WRITTEN = {
     *("transforms_val.json", "header.json", "metrics.json", "timings.json", "options.toml"),
     *("OUT/timings.json", "OUT/options.toml", "report/index.html"),
     *("reflfield_bsdf.py", "render.py", "info.json", "build_object.py"),
-    *("DIR/check.json", "DIR/index.html", "check.json", "tradeoff.json"),
+    *("DIR/check.json", "DIR/index.html", "check.json", "tradeoff.json", "calibration.json"),
     *("truth/effects.json", "truth/rig.json", "results/NAME.json"),
 }
 # A measured figure: a number with the unit of a quality, a size or a time.
