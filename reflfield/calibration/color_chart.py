@@ -152,8 +152,11 @@ def check_installed() -> None:
 
 @contextmanager
 def _libraries() -> Iterator[tuple[Any, Any]]:
-    """The packages, imported when they are used; what they lack themselves is not warned of."""
-    with warnings.catch_warnings():
+    """The packages, imported when they are used; what they lack themselves is not warned of.
+
+    One of them changes how NumPy prints arrays: that is undone.
+    """
+    with warnings.catch_warnings(), np.printoptions():
         warnings.simplefilter("ignore")
         yield import_module("colour"), import_module("colour_checker_detection")
 

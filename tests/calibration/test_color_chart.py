@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -21,10 +22,25 @@ from tests.calibration.planted_poses import simulate
 CAMERA_FROM_LINEAR = np.array([[0.40, 0.12, 0.03], [0.06, 0.55, 0.09], [0.02, 0.10, 0.28]])
 
 
+def needs_the_extra():
+    """Skip without it; not by an import, which would change how NumPy prints."""
+    if find_spec("colour_checker_detection") is None:
+        pytest.skip("needs the extra color")
+
+
+def test_numpy_prints_as_before_after_the_libraries_were_used():
+    """One of them switches NumPy to how it printed arrays in 2017."""
+    needs_the_extra()
+    with color_chart._libraries():
+        pass
+    assert repr(np.array([1.0, 2.0])) == "array([1., 2.])"
+    assert np.get_printoptions()["legacy"] is False
+
+
 @pytest.fixture
 def chart_photograph():
     """Function that draws the chart as a camera sees it, linear."""
-    pytest.importorskip("colour_checker_detection", reason="needs the extra color")
+    needs_the_extra()
     with color_chart._libraries() as (colour, _):
         colors = color_chart._reference(colour)
 
@@ -115,7 +131,7 @@ def test_command(dome, chart_photograph, tmp_path):
 
 
 def test_chart_of_a_museum(shared_data, tmp_path):
-    pytest.importorskip("colour_checker_detection", reason="needs the extra color")
+    needs_the_extra()
     path = shared_data("mia_rodin_metashape") / "colorchecker_231016_miaEURO_9505.jpg"
     correction = color_correction(read_image(path), path.name)
     assert correction.n_used >= 12

@@ -61,11 +61,11 @@ def test_turntables_beyond_the_ceiling_are_refused(reflfield, ball_file, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("command", "width"), [("relight", 9000), ("compare", 4000)])
+@pytest.mark.parametrize(("command", "width"), [("relight", 9000), ("compare", 5000)])
 def test_frames_beyond_the_ceiling_are_refused(
     reflfield, ball_file, tmp_path, command, width, rng
 ):
-    """64 bytes for a pixel to relight, 160 to compare."""
+    """64 bytes for a pixel to relight, 88 to compare."""
     where = frames(tmp_path / "frames", width)
     if command == "compare":
         picture = np.zeros((width, width, 1), np.float32)
