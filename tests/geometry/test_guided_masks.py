@@ -80,7 +80,7 @@ def test_backdrop_by_clean_plates(scene):
         assert overlap(mask.covered, covered) > GOOD
 
 
-def test_what_one_view_misses_the_others_restore(scene):
+def test_what_one_view_misses_the_others_keep(scene):
     views, truth, photographs, _ = scene
     painted = [photograph.copy() for photograph in photographs]
     rows = np.flatnonzero(truth[4].any(axis=1))
@@ -88,9 +88,9 @@ def test_what_one_view_misses_the_others_restore(scene):
     painted[4][band][truth[4][band]] = GREEN  # part of the ball has the table's colour
     masks = guided_masks(views, painted.__getitem__, MaskOptions(NAMED, rounds=1))
     kept = [overlap(m.covered, t) for m, t in zip(masks, truth, strict=True)]
-    # The others do not lose what this view does not show.
     assert min(kept[:4] + kept[5:]) > GOOD
-    assert kept[4] > 0.75
+    # What looks like the backdrop stays lost to this view: a sixth of the ball's height.
+    assert 0.85 < kept[4] < GOOD
 
 
 def test_plate_of_another_size_is_refused(scene):
@@ -104,7 +104,8 @@ def test_colours_are_recognised_in_shadow():
     black, lit = np.zeros((1, 1, 3), np.uint8), np.uint8([[[64, 138, 79]]])
     assert not has_colours(black, NAMED).any()
     assert has_colours(lit, NAMED).all()
-    assert has_colours((lit * 0.8).astype(np.uint8), NAMED).all()
+    # In two thirds of the light, where lightness alone differs by more than may be.
+    assert has_colours((lit * 0.65).astype(np.uint8), NAMED).all()
 
 
 @pytest.mark.parametrize("text", ["green", "12345", "#12345g"])
