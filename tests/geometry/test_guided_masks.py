@@ -7,7 +7,13 @@ from reflfield.api.masks import make_masks, parse_colour
 from reflfield.capture.cameras import Camera
 from reflfield.errors import InputError, ShapeError
 from reflfield.geometry import guided_masks as guided_masks_module
-from reflfield.geometry.guided_masks import MaskOptions, guided_masks, has_colours, overlap
+from reflfield.geometry.guided_masks import (
+    MaskOptions,
+    guided_masks,
+    has_colours,
+    overlap,
+    refined_mask,
+)
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.visual_hull import HullOptions
@@ -91,6 +97,18 @@ def test_what_one_view_misses_the_others_keep(scene):
     assert min(kept[:4] + kept[5:]) > GOOD
     # What looks like the backdrop stays lost to this view: a sixth of the ball's height.
     assert 0.85 < kept[4] < GOOD
+
+
+def test_hull_restores_a_hole_and_takes_away_clutter(rng):
+    """A disc whose mask lacks a bite and has a blob beside it, both of the disc's colour."""
+    y, x = np.mgrid[:96, :96]
+    disc = np.hypot(x - 48, y - 48) < 26
+    bite, blob = np.hypot(x - 48, y - 40) < 10, np.hypot(x - 84, y - 48) < 10
+    colours = np.where((disc | blob)[..., None], [130, 90, 60], [70, 140, 80])
+    encoded = np.uint8(np.clip(colours + rng.normal(0, 4, colours.shape), 0, 255))
+    mask = (disc & ~bite) | blob
+    assert overlap(mask, disc) < 0.8
+    assert overlap(refined_mask(encoded, disc, mask, 0.04), disc) > GOOD
 
 
 def test_plate_of_another_size_is_refused(scene):
