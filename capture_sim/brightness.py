@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.effects import antialiasing, near_lights, shadows
-from capture_sim.effects.registry import decided
+from capture_sim.effects.effect_registry import decided
 from capture_sim.effects.sensor import dark_noise
 from capture_sim.model import Brightness, Scene, Table
 from capture_sim.rays import RayTracer

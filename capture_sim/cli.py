@@ -24,7 +24,7 @@ from rich.progress import (
 from rich.table import Table
 
 from capture_sim.dome import rig_presets
-from capture_sim.effects.registry import read_choice
+from capture_sim.effects.effect_registry import read_choice
 from capture_sim.errors import SceneError, scene_error, shown
 from capture_sim.inputs import memory_limit
 from capture_sim.materials import material_presets

@@ -22,7 +22,7 @@ from capture_sim.effects import (
     exposure_brackets,
     simulated,
 )
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.effect_registry import EFFECTS
 from capture_sim.effects.sensor import exposed
 from capture_sim.model import Scene
 from capture_sim.photograph import photographs, set_up, toggled

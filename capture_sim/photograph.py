@@ -199,7 +199,7 @@ def toggled(scene: Scene, effect: Effect) -> Scene:
     Parameters
     ----------
     scene : Scene
-        From `capture_sim.effects.registry.decided`.
+        From `capture_sim.effects.effect_registry.decided`.
     effect : module
 
     Returns

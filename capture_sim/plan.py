@@ -17,7 +17,7 @@ import numpy as np
 
 from capture_sim.brightness import coarser, measured, spread
 from capture_sim.effects import Cost, Effect, Workload, simulated
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.effect_registry import EFFECTS
 from capture_sim.files import write_exr
 from capture_sim.memory import fitted
 from capture_sim.model import Scene

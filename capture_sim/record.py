@@ -19,7 +19,7 @@ from typing import Any
 
 from capture_sim.contributions import Contribution
 from capture_sim.effects import Effect, simulated, threshold
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.effect_registry import EFFECTS
 from capture_sim.files import write_exr, write_json, write_whole
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup

@@ -45,7 +45,7 @@ from pathlib import Path
 from typing import Any
 
 from capture_sim.dome import make_cameras, make_lights
-from capture_sim.effects.registry import read_effects
+from capture_sim.effects.effect_registry import read_effects
 from capture_sim.errors import SceneError, scene_error
 from capture_sim.inputs import read_bytes
 from capture_sim.materials import make_material

@@ -100,8 +100,9 @@ def test_every_package_has_its_place():
     assert present == set(PACKAGES)
 
 
-def test_a_module_name_occurs_once():
-    names = [path.stem for path in modules("reflfield") if path.stem != "__init__"]
+@pytest.mark.parametrize("package", ["reflfield", "capture_sim"])
+def test_a_module_name_occurs_once(package):
+    names = [path.stem for path in modules(package) if path.stem != "__init__"]
     assert sorted(names) == sorted(set(names))
 
 

@@ -17,6 +17,7 @@ from capture_sim.effects import (
 )
 from capture_sim.model import Scene
 
+# In the order in which they act.
 RIG_EFFECTS = (
     lens_distortion,
     pose_error,

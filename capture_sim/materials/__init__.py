@@ -8,7 +8,7 @@ which of several materials is there (`label`).
 
 from capture_sim.materials.analytic import GGX, AshikhminShirley, Lambert
 from capture_sim.materials.base import Material
-from capture_sim.materials.registry import make_material, material_presets
+from capture_sim.materials.material_registry import make_material, material_presets
 from capture_sim.materials.rgl import MeasuredRGL, read_rgl
 from capture_sim.materials.spatial import Mixed, SpatiallyVarying, frames_from
 from capture_sim.materials.textures import Texture, make_texture, read_image

@@ -5,9 +5,9 @@ Normals are those of the smooth surface that the triangles stand for, tangents
 its derivative dP/du.
 """
 
-from capture_sim.objects.files import finish_mesh, read_mesh
 from capture_sim.objects.mesh import SurfaceMesh
-from capture_sim.objects.registry import make_object, object_presets
+from capture_sim.objects.mesh_files import finish_mesh, read_mesh
+from capture_sim.objects.object_registry import make_object, object_presets
 from capture_sim.objects.revolution import revolve, sweep
 
 __all__ = [

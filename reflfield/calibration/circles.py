@@ -132,7 +132,7 @@ def _candidates(mean: Float32) -> list[Circle]:
     small, factor = _shrunk(mean, SEARCH_PIXELS)
     levels = cv2.GaussianBlur((255 * small).astype(np.uint8), (0, 0), 1.5)
     shorter = min(small.shape)
-    found: list[Circle] = []
+    candidates: list[Circle] = []
     for votes in (40, 25, 15):
         circles = cv2.HoughCircles(
             levels,
@@ -146,8 +146,8 @@ def _candidates(mean: Float32) -> list[Circle]:
         )
         if circles is not None:
             rows = circles.reshape(-1, circles.shape[-1])[:CANDIDATES]
-            found += [Circle(*map(float, row[:3])).scaled(1 / factor) for row in rows]
-    return found
+            candidates += [Circle(*map(float, row[:3])).scaled(1 / factor) for row in rows]
+    return candidates
 
 
 def edge_strength(image: Float32, circle: Circle, width: float = 0.02) -> float:

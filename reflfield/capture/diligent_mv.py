@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.calibrated_views import View, assembled_capture
-from reflfield.capture.cameras import OPENCV, Camera
+from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
-from reflfield.capture.described_items import described_camera, described_light
+from reflfield.capture.described_items import camera_of_matrix, described_light
 from reflfield.capture.fixed_view import FixedView, linear_unless_stated
 from reflfield.capture.image_files import image_size
 from reflfield.capture.light_lists import (
@@ -147,14 +147,4 @@ def _camera(matrix: Array, pose: Array, size: tuple[int, int], description: Path
         )
     camera_from_world = np.eye(4)
     camera_from_world[:3, :3], camera_from_world[:3, 3] = rotation, translation
-    return described_camera(
-        what,
-        kind=OPENCV,
-        width=size[0],
-        height=size[1],
-        fl_x=lens[0, 0],
-        fl_y=lens[1, 1],
-        cx=lens[0, 2] + 0.5,
-        cy=lens[1, 2] + 0.5,
-        camera_from_world=camera_from_world,
-    )
+    return camera_of_matrix(what, lens, size, camera_from_world)

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.cameras import OPENCV, Camera
+from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
-from reflfield.capture.described_items import described_camera, described_light
+from reflfield.capture.described_items import camera_of_matrix, described_light
 from reflfield.capture.documents import check_counts
 from reflfield.capture.fixed_view import (
     fixed_view_capture,
@@ -107,18 +107,8 @@ def _camera(matrix: Array, pose: Array, size: tuple[int, int], description: Path
         raise CaptureError(
             f"{what}: expected a camera matrix without skew, received {matrix.tolist()}"
         )
-    return described_camera(
-        what,
-        kind=OPENCV,
-        width=size[0],
-        height=size[1],
-        fl_x=matrix[0, 0],
-        fl_y=matrix[1, 1],
-        # MATLAB counts pixels from 1 at the centre of the first one, which is .5 here.
-        cx=matrix[0, 2] - 0.5,
-        cy=matrix[1, 2] - 0.5,
-        camera_from_world=pose,
-    )
+    # MATLAB counts pixels from 1.
+    return camera_of_matrix(what, matrix, size, pose, counts_from=1)
 
 
 def _depth(positions: Array, directions: Array, description: Path) -> float:

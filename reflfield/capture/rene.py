@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.calibrated_views import View, assembled_capture
-from reflfield.capture.cameras import OPENCV, Camera, not_rigid_because
+from reflfield.capture.cameras import Camera, not_rigid_because
 from reflfield.capture.capture import Capture
-from reflfield.capture.described_items import described_camera, described_light
+from reflfield.capture.described_items import camera_of_matrix, described_light
 from reflfield.capture.documents import number_array, parse_number, read_text
 from reflfield.capture.image_files import read_image
 from reflfield.capture.lights import Light
@@ -155,17 +155,11 @@ def _camera(lens: Mapping[str, Array], world_from_camera: Array, what: str) -> C
     if fault:
         raise CaptureError(f"{what}: expected a rotation and a translation, received {fault}")
     matrix, size = lens["camera_matrix"], lens["image_size"]
-    return described_camera(
+    return camera_of_matrix(
         what,
-        kind=OPENCV,
-        width=size[0],
-        height=size[1],
-        fl_x=matrix[0, 0],
-        fl_y=matrix[1, 1],
-        # OpenCV counts from 0 at the centre of the first pixel, which is .5 here.
-        cx=matrix[0, 2] + 0.5,
-        cy=matrix[1, 2] + 0.5,
-        camera_from_world=np.linalg.solve(world_from_camera, np.eye(4)),
+        matrix,
+        size,
+        np.linalg.solve(world_from_camera, np.eye(4)),
         distortion=tuple(lens["dist_coeffs"].ravel().tolist()),
     )
 

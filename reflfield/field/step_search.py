@@ -22,6 +22,43 @@ MAX_CANDIDATES = 14
 START_SHARE = 2.0**-10
 
 
+def field_as_asked(
+    build: Callable[[float], Field],
+    measure: Callable[[Field], float],
+    step: float,
+    *,
+    size: int = 0,
+    least: float = 0.0,
+) -> Field:
+    """Field of a size, else of at least a quality, else of the step itself.
+
+    Parameters
+    ----------
+    build, measure : callable
+        As of `field_of_quality`.
+    step : float
+        Quantisation step, or where the search for one begins.
+    size : int
+        Bytes of the file, at most; 0 asks for none.
+    least : float
+        Quality; 0 asks for none.
+
+    Returns
+    -------
+    ReflectanceField
+
+    Raises
+    ------
+    InputError
+        As `field_of_size`.
+    """
+    if size:
+        return field_of_size(build, step, size)
+    if least:
+        return field_of_quality(build, measure, step, least)
+    return build(step)
+
+
 def field_of_size(build: Callable[[float], Field], step: float, size: int) -> Field:
     """Field whose file comes close to a size, from below.
 

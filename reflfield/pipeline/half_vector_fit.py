@@ -21,7 +21,7 @@ from reflfield.field.file import write_field
 from reflfield.field.half_vector import HalfVectorModel, HalfVectorOptions
 from reflfield.field.half_vector_build import build_half_vector_field
 from reflfield.field.reflectance_field import HalfVectorField
-from reflfield.field.step_search import field_of_quality, field_of_size
+from reflfield.field.step_search import field_as_asked
 from reflfield.fitting.image_fit import ImageFit, frames_with, image_step, pixel_rows
 from reflfield.fitting.lobe_count import (
     fewest_lobes,
@@ -301,11 +301,7 @@ class HalfVectorFit:
         def build(at: float) -> HalfVectorField:
             return self.build(model, at)
 
-        if options.size:
-            return field_of_size(build, step, options.size)
-        if options.psnr:
-            return field_of_quality(build, self.quality, step, options.psnr)
-        return build(step)
+        return field_as_asked(build, self.quality, step, size=options.size, least=options.psnr)
 
     def step(self, relative_step: float) -> float:
         """Quantisation step of cube roots of samples."""

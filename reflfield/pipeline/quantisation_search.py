@@ -20,7 +20,7 @@ from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.file import PackedSizes
 from reflfield.field.observed_sphere import distinct_directions
 from reflfield.field.reflectance_field import ClusteredField
-from reflfield.field.step_search import field_of_quality, field_of_size
+from reflfield.field.step_search import field_as_asked
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.image_projection import directions_of
 from reflfield.observations.texel_reading import TexelReader
@@ -101,11 +101,7 @@ class FieldMaker:
         def build(at: float) -> ClusteredField:
             return self.build(model, frames, at)
 
-        if options.size:
-            return field_of_size(build, step, options.size)
-        if options.psnr:
-            return field_of_quality(build, self.quality, step, options.psnr)
-        return build(step)
+        return field_as_asked(build, self.quality, step, size=options.size, least=options.psnr)
 
     def quality(self, field: ClusteredField) -> float:
         """LDR PSNR on the samples, dB."""

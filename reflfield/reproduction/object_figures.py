@@ -58,7 +58,7 @@ distance = 1.0
 frames = 4
 [truth]
 per_view = false
-points = 100
+points = {points}
 """
 # Rigs that have so many cameras and lamps.
 DOMES = {81: "ubo81", 151: "bonn151"}
@@ -83,8 +83,17 @@ CENTRE = (0.0, 0.0, 0.1)
 SKY_ROWS = 16
 
 
-def scene_text(directions: int, pixels: int) -> str:
+def scene_text(directions: int, pixels: int, n_points: int = 100) -> str:
     """Scene of the simulator with so many cameras and as many lamps.
+
+    Parameters
+    ----------
+    directions : int
+        Cameras, and lamps.
+    pixels : int
+        Side of the photographs.
+    n_points : int
+        Points of the surface whose true samples are written.
 
     Examples
     --------
@@ -93,7 +102,9 @@ def scene_text(directions: int, pixels: int) -> str:
     """
     count = "" if directions in DOMES else f"n = {directions}\nmax_inclination_deg = 75"
     rig = DOMES.get(directions, "fibonacci")
-    return SCENE.format(directions=directions, rig=rig, count=count, pixels=pixels)
+    return SCENE.format(
+        directions=directions, rig=rig, count=count, pixels=pixels, points=n_points
+    )
 
 
 def make_object(folder: Path, directions: int, pixels: int, workers: int) -> Result:

@@ -81,10 +81,10 @@ def main():
                 outcome(dome, fault, Path(folder) / f"{name} {seed}", seed)
                 for seed in range(words.seeds)
             ]
-            found, named, severity, others, seconds = zip(*runs, strict=True)
+            detected, named, severity, others, seconds = zip(*runs, strict=True)
             also = ", ".join(sorted({kind for kinds in others for kind in kinds})) or "nothing"
             print(
-                f"| {name} | {sum(found)} of {len(runs)} | {sum(named)} of {len(runs)} | "
+                f"| {name} | {sum(detected)} of {len(runs)} | {sum(named)} of {len(runs)} | "
                 f"{'/'.join(sorted(set(severity)))} | {also} | {np.mean(seconds):.1f} s |",
                 flush=True,
             )

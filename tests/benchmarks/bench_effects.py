@@ -23,7 +23,7 @@ from benchmarks.measuring import Results
 from capture_sim.brightness import measured
 from capture_sim.contributions import contributions, some_pairs
 from capture_sim.effects import dropped_photographs, threshold
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.effect_registry import EFFECTS
 from capture_sim.model import Scene
 from capture_sim.photograph import set_up
 from capture_sim.rays import RayTracer

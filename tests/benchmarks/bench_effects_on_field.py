@@ -37,7 +37,7 @@ from capture_sim.effects import (
     lens_distortion,
     light_extent,
 )
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.effect_registry import EFFECTS
 from capture_sim.model import Scene
 from capture_sim.scene import load_scene
 from capture_sim.write import write_capture

@@ -38,31 +38,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import distributed
 from benchmarks.measuring import Results
 
-SCENE = """
-effects = ["antialiasing", "near_lights", "shadows"]
-[object]
-preset = "vase"
-[material]
-preset = "painted_vase"
-[cameras]
-preset = "{rig}"
-{directions}
-target = [0.0, 0.0, 0.1]
-distance = 1.0
-extent = 0.25
-width = {pixels}
-height = {pixels}
-[lights]
-preset = "{rig}"
-{directions}
-target = [0.0, 0.0, 0.1]
-distance = 1.0
-[heldout]
-frames = 4
-[truth]
-per_view = false
-points = {points}
-"""
+from reflfield.reproduction.object_figures import scene_text
+
 # Works of the stages that go texel by texel: all texels that are seen, but for those that
 # shape the basis in the first. Of the other works the number of texels is no matter.
 SHAPING, COMPLETING = "resampling for the basis", "completing all texels"
@@ -91,12 +68,7 @@ def simulate(arguments: argparse.Namespace) -> Path:
     arguments.out.mkdir(parents=True, exist_ok=True)
     scene = arguments.out / "paper_scale.toml"
     scene.write_text(
-        SCENE.format(
-            rig=arguments.rig,
-            directions=f"n = {arguments.directions}" if arguments.directions else "",
-            pixels=arguments.pixels,
-            points=arguments.points,
-        )
+        scene_text(arguments.directions, arguments.pixels, n_points=arguments.points)
     )
     started = time.perf_counter()
     command = Path(sys.executable).with_name("capture-sim")
@@ -143,8 +115,9 @@ def processed(arguments: argparse.Namespace, capture: Path) -> None:
     call(*process_words(arguments, capture, out, arguments.texels, 2048))
     timings = json.loads((out / "timings.json").read_text())
     results = Results("scale", "The paper's job", MEASURED)
-    size = f"{arguments.pixels} pixels, {arguments.texels} texels a side"
-    results.table(f"{arguments.rig}, {size}")
+    directions, pixels = arguments.directions, arguments.pixels
+    size = f"{pixels} pixels, {arguments.texels} texels a side"
+    results.table(f"{directions} x {directions} photographs, {size}")
     for stage in timings["stages"]:
         say(stage["name"], stage["seconds"], stage["cpu_seconds"], stage["peak_bytes"])
         results.add(stage_cells(stage["name"], stage))
@@ -373,7 +346,9 @@ def per_texel(arguments: argparse.Namespace, capture: Path) -> None:
     print("texture       texels   CPU time per texel, ms: " + ", ".join(BY_TEXELS))
     totals = []
     results = Results("scale_per_texel", "What one texel costs", MEASURED)
-    results.table(f"{arguments.rig}, CPU time of a texel, ms")
+    results.table(
+        f"{arguments.directions} x {arguments.directions} photographs, CPU time of a texel, ms"
+    )
     for side in arguments.per_texel:
         out = arguments.out / f"texels_{side}"
         words = process_words(arguments, capture, out, side, arguments.training)
@@ -407,8 +382,7 @@ def main() -> None:
     """Parse, simulate, and what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
-    parser.add_argument("--rig", default="bonn151", help="cameras and lights; also ubo81")
-    parser.add_argument("--directions", type=int, help="of the rigs that have a number")
+    parser.add_argument("--directions", type=int, default=151, help="cameras, and lights")
     parser.add_argument("--pixels", type=int, default=256, help="side of the photographs")
     parser.add_argument("--texels", type=int, default=256, help="side of the texture")
     parser.add_argument("--points", type=int, default=100, help="true ABRDFs to compare with")

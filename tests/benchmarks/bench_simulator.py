@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 from benchmarks.measuring import Results
 
-from capture_sim.effects.registry import decided
+from capture_sim.effects.effect_registry import decided
 from capture_sim.files import write_exr
 from capture_sim.memory import parse_bytes
 from capture_sim.model import EffectOptions, TruthOptions

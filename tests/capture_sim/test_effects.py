@@ -12,7 +12,7 @@ from capture_sim.effects import (
     shadows,
     simulated,
 )
-from capture_sim.effects.registry import EFFECTS, decided
+from capture_sim.effects.effect_registry import EFFECTS, decided
 from capture_sim.errors import SceneError
 from capture_sim.scene import parse_scene
 

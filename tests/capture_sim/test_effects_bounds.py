@@ -6,7 +6,7 @@ import pytest
 from capture_sim.brightness import frame_scale, measured, relative_change
 from capture_sim.contributions import contributions, some_pairs
 from capture_sim.effects import light_extent, simulated
-from capture_sim.effects.registry import EFFECTS
+from capture_sim.effects.effect_registry import EFFECTS
 from capture_sim.rays import RayTracer
 from capture_sim.scene import parse_scene
 

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from capture_sim.effects.registry import NAMES
+from capture_sim.effects.effect_registry import NAMES
 from capture_sim.plan import plan
 from capture_sim.scene import parse_scene
 from capture_sim.write import write_capture

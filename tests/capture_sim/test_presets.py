@@ -8,7 +8,7 @@ import pytest
 from capture_sim.brightness import measured
 from capture_sim.contributions import arriving, contributions, some_pairs
 from capture_sim.effects import threshold
-from capture_sim.effects.registry import EFFECTS, decided
+from capture_sim.effects.effect_registry import EFFECTS, decided
 from capture_sim.rays import RayTracer
 from capture_sim.scene import load_scene
 

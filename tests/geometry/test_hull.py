@@ -217,10 +217,10 @@ def test_distances_that_some_views_undercut_do_not_depend_on_how_they_are_found(
     views = rigs.cameras(18, size=48)
     measured = measured_views(views, [rigs.ball_silhouette(v, samples=2) for v in views])
     points = rng.normal(size=(3000, 3)) * 0.7
-    found = []
+    distances = []
     for most in (-1, 100):
         monkeypatch.setattr(carving, "_MOST_SORTED", most)
         monkeypatch.setattr(carving, "_PARTITIONED_POINTS", 700)
-        found.append(carving.smallest_distance(measured, points, tolerance, np.inf))
-    np.testing.assert_array_equal(*found)
-    assert np.isfinite(found[0]).all() == (tolerance < 18)
+        distances.append(carving.smallest_distance(measured, points, tolerance, np.inf))
+    np.testing.assert_array_equal(*distances)
+    assert np.isfinite(distances[0]).all() == (tolerance < 18)

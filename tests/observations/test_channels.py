@@ -156,10 +156,10 @@ def test_luminance_of_a_lamp_of_one_colour_is_that_under_white_light(reader_of):
     reader = reader_of(4, 12, colour)
     samples = reader.measured(np.arange(N))
     cosine = softened_cosine(local_directions(reader.local_from_world, samples.lights)[..., 2])
-    found = luminance_of(samples, cosine).reshape(N, 4, 12)
+    luminance = luminance_of(samples, cosine).reshape(N, 4, 12)
     # Halves round to eleven bits.
-    expected = np.broadcast_to((cosine * (colour @ LUMINANCE))[:, None], found.shape)
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
+    expected = np.broadcast_to((cosine * (colour @ LUMINANCE))[:, None], luminance.shape)
+    np.testing.assert_allclose(luminance, expected, rtol=2e-3, atol=1e-6)
 
 
 def test_luminance_beside_whole_samples_is_exact_for_one_colour(rng):
@@ -170,9 +170,9 @@ def test_luminance_beside_whole_samples_is_exact_for_one_colour(rng):
     gaps[:, 0] = False
     samples = texel_samples(rng, 3, 4, 5, samples=np.where(gaps, np.nan, values))
     nothing = gaps.all(axis=3)
-    found = luminance_of(samples, np.ones((3, 5), np.float32)).reshape(3, 4, 5)
-    assert np.isnan(found[nothing]).all()
-    np.testing.assert_allclose(found[~nothing], (values @ LUMINANCE)[~nothing], rtol=1e-5)
+    luminance = luminance_of(samples, np.ones((3, 5), np.float32)).reshape(3, 4, 5)
+    assert np.isnan(luminance[nothing]).all()
+    np.testing.assert_allclose(luminance[~nothing], (values @ LUMINANCE)[~nothing], rtol=1e-5)
 
 
 def test_shade_is_the_mean_of_what_was_measured(reader_of, rng):

@@ -174,15 +174,15 @@ class TestLuminance:
         capture = dome(5, 4, missing={(2, 3)})
         reader = reader_of(capture, rng.random((9, 5, 4, 3)), views=views, lights=lights)
         texels = np.array([8, 1, 3])
-        found = reader.luminance(texels)
+        luminance = reader.luminance(texels)
         pairs = PhotographedPairs.of(capture)
         seen = views[texels][:, :, None] & lights[texels][:, None] & pairs.table
-        np.testing.assert_array_equal(np.isfinite(found.samples), seen)
+        np.testing.assert_array_equal(np.isfinite(luminance.samples), seen)
         stored = pairs.as_product(reader.store.read(texels).astype(float), np.nan)
         red, green, blue = np.moveaxis(stored, 3, 0)
         expected = 0.2126 * red + 0.7152 * green + 0.0722 * blue
         eps = np.finfo(np.float32).eps
-        np.testing.assert_allclose(found.samples[seen], expected[seen], rtol=4 * eps)
+        np.testing.assert_allclose(luminance.samples[seen], expected[seen], rtol=4 * eps)
 
     def test_directions_are_those_to_cameras_and_lights_in_the_frame(self, reader):
         texels = np.array([31, 4])

@@ -76,10 +76,10 @@ def test_values_not_measured_do_not_count(field, reader_of, rng):
     values = stored[:]
     values[rng.random(values.shape) < 0.3] = np.nan
     stored[:] = values
-    found = sample_error(field, reader, np.arange(field.n_texels))
-    assert found.linear == pytest.approx(0.5, abs=2 * HALF)
+    error = sample_error(field, reader, np.arange(field.n_texels))
+    assert error.linear == pytest.approx(0.5, abs=2 * HALF)
     observed = reader.store.observed.of_texels(slice(None))
-    assert found.n_samples == (observed & ~np.isnan(values).all(axis=2)).sum()
+    assert error.n_samples == (observed & ~np.isnan(values).all(axis=2)).sum()
 
 
 def test_error_is_relative_to_the_samples(field, reader_of):

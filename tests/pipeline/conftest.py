@@ -16,36 +16,14 @@ from reflfield.cli import main
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline.cache import StageFolder
 from reflfield.pipeline.context import Context
+from tests.tiny_dome import ball_scene
 
 # Cuts all blocks small when it is imported, which is for processes of its own only: looked
 # into for doctests, it would do so to every test.
 collect_ignore = ["counted.py"]
 
-# A satin ball seen by 10 cameras of 32 x 32 pixels under 6 lights: a run takes seconds.
-SCENE = {
-    "name": "tiny",
-    "object": {"preset": "sphere", "radius": 0.05},
-    "material": {"preset": "satin"},
-    "cameras": {
-        "preset": "rings",
-        "elevations_deg": [-30, 10, 50],
-        "counts": [3, 4, 3],
-        "offsets_deg": [0, 30, 0],
-        "distance": 0.5,
-        "extent": 0.13,
-        "width": 32,
-        "height": 32,
-    },
-    "lights": {
-        "preset": "rings",
-        "elevations_deg": [10, 60],
-        "counts": [4, 2],
-        "distance": 0.6,
-    },
-    "image": {"samples_per_side": 1, "edge_samples_per_side": 2},
-    "heldout": {"frames": 2},
-    "truth": {"points": 20},
-}
+# A satin ball under 6 lights.
+SCENE = ball_scene("tiny", heldout={"frames": 2}, truth={"points": 20})
 OPTIONS = """
 [hull]
 resolution = 32

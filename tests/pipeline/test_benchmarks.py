@@ -83,7 +83,7 @@ def test_bench_effects_on_field(subprocess_run, tiny_options, tmp_path):
 def scale(tiny_options, tmp_path):
     """Words of the script, for a small capture."""
     return (
-        *(BENCHMARKS / "bench_scale.py", tmp_path, "--rig", "fibonacci", "--directions", 12),
+        *(BENCHMARKS / "bench_scale.py", tmp_path, "--directions", 12),
         *("--pixels", 24, "--texels", 64, "--points", 0, "--config", tiny_options),
     )
 

@@ -97,9 +97,9 @@ def test_compare_says_that_there_are_no_photographs_of_the_field(
     assert set(without["baselines"]) & set(NAMES) == {"black", "mean_texture"}
     outcome = reflfield(*words, "-o", tmp_path / "with", "--photographs", tiny_capture)
     assert outcome.status == 0, outcome.err
-    found = json.loads((tmp_path / "with" / "metrics.json").read_text())
-    assert len(found["baselines"]["nearest_photograph"]["frames"]) == 2
-    assert found["baselines"]["black"] == without["baselines"]["black"]
+    beside = json.loads((tmp_path / "with" / "metrics.json").read_text())
+    assert len(beside["baselines"]["nearest_photograph"]["frames"]) == 2
+    assert beside["baselines"]["black"] == without["baselines"]["black"]
 
 
 def test_one_image_of_a_baseline_is_held_at_a_time():

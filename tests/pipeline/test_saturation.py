@@ -20,31 +20,15 @@ from reflfield.options import HoldOut, with_tables
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.pipeline.stages import run
 from reflfield.render.relit_photographs import relight_photographs
+from tests.tiny_dome import ball_scene
 
 # Matt, so that what is clipped under one light is not under another.
-SCENE = {
-    "name": "overexposed",
-    "object": {"preset": "sphere", "radius": 0.05},
-    "material": {"preset": "grey_card", "albedo": 0.8},
-    "cameras": {
-        "preset": "rings",
-        "elevations_deg": [-30, 10, 50],
-        "counts": [3, 4, 3],
-        "offsets_deg": [0, 30, 0],
-        "distance": 0.5,
-        "extent": 0.13,
-        "width": 32,
-        "height": 32,
-    },
-    "lights": {
-        "preset": "rings",
-        "elevations_deg": [10, 60],
-        "counts": [6, 4],
-        "distance": 0.6,
-    },
-    "image": {"samples_per_side": 1, "edge_samples_per_side": 2},
-    "truth": {"points": 0, "per_view": False},
-}
+SCENE = ball_scene(
+    "overexposed",
+    {"preset": "grey_card", "albedo": 0.8},
+    n_lights=(6, 4),
+    truth={"points": 0, "per_view": False},
+)
 # A quarter of the lit values are brighter.
 WHITE = 0.2
 

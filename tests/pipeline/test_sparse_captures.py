@@ -56,13 +56,13 @@ def test_samples_are_those_of_the_product_that_were_photographed(
     words = ("--config", tiny_options, "--until", "observations")
     outcome = reflfield("run", capture_copy, "-o", out, *words)
     assert outcome.status == 0, outcome.err
-    whole, found = samples_in(product), samples_in(out)
+    whole, sparse = samples_in(product), samples_in(out)
     n_texels = whole.shape[0]
     assert whole.shape == (n_texels, N_VIEWS * N_LIGHTS, 3)
-    assert found.shape == (n_texels, photographed.sum(), 3)
+    assert sparse.shape == (n_texels, photographed.sum(), 3)
     # The units of the two captures are powers of two.
     values = whole[:].astype(np.float64) * whole.attrs["unit"]
     expected = values.reshape(n_texels, N_VIEWS, N_LIGHTS, 3)[:, photographed]
-    np.testing.assert_array_equal(found[:].astype(np.float64) * found.attrs["unit"], expected)
+    np.testing.assert_array_equal(sparse[:].astype(np.float64) * sparse.attrs["unit"], expected)
     counted = json.loads((out / "stages" / "observations" / "stage.json").read_text())
     assert counted["counts"]["photographs"] == photographed.sum()

@@ -14,28 +14,9 @@ from reflfield.tradeoff import sweep as sweep_module
 from reflfield.tradeoff.measured_run import OUTCOME
 from reflfield.tradeoff.sweep import Sweep
 from reflfield.tradeoff.swept_options import value_of
+from tests.tiny_dome import ball_scene
 
-SCENE = {
-    "name": "tiny_product",
-    "object": {"preset": "sphere", "radius": 0.05},
-    "material": {"preset": "satin"},
-    "cameras": {
-        "preset": "rings",
-        "elevations_deg": [-30, 10, 50],
-        "counts": [3, 4, 3],
-        "distance": 0.5,
-        "extent": 0.13,
-        "width": 32,
-        "height": 32,
-    },
-    "lights": {
-        "preset": "rings",
-        "elevations_deg": [10, 60],
-        "counts": [6, 4],
-        "distance": 0.6,
-    },
-    "image": {"samples_per_side": 1, "edge_samples_per_side": 2},
-}
+SCENE = ball_scene("tiny_product", n_lights=(6, 4))
 
 
 @pytest.fixture(scope="session")

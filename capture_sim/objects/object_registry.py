@@ -10,8 +10,8 @@ from typing import Any
 
 from capture_sim.errors import scene_error
 from capture_sim.objects.convexity import is_convex
-from capture_sim.objects.files import mesh_from_file
 from capture_sim.objects.mesh import SurfaceMesh
+from capture_sim.objects.mesh_files import mesh_from_file
 from capture_sim.objects.plates import plane, relief
 from capture_sim.objects.revolution import bowl, sphere, vase
 from capture_sim.tables import Table, TableReader

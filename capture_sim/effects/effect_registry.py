@@ -10,18 +10,11 @@ from capture_sim.effects import (
     bayer,
     black_level,
     defocus,
-    dropped_photographs,
     environment,
     exposure_brackets,
-    falloff_profile,
     interreflection,
-    lens_distortion,
     light_extent,
-    light_position_error,
-    light_variation,
-    misregistration,
     near_lights,
-    pose_error,
     quantisation,
     saturation,
     sensor_noise,
@@ -30,18 +23,13 @@ from capture_sim.effects import (
     subsurface,
     vignetting,
 )
+from capture_sim.effects.rig import RIG_EFFECTS
 from capture_sim.errors import scene_error
 from capture_sim.model import EffectOptions, Scene
 from capture_sim.tables import Table, TableReader, read_options
 
 EFFECTS: tuple[Effect, ...] = (
-    lens_distortion,
-    pose_error,
-    misregistration,
-    falloff_profile,
-    light_position_error,
-    light_variation,
-    dropped_photographs,
+    *RIG_EFFECTS,
     antialiasing,
     near_lights,
     shadows,
