@@ -7,23 +7,10 @@ import numpy as np
 from reflfield.field.basis import BasisProblem
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.observations.texel_samples import CHANNEL_BITS, TransformedSamples, all_channels
-from reflfield.sphere.hemisphere import HemisphereGrid
+from tests.observations.rigs import random_taps, random_weights
 
 SIDES = (3, 3)
 NODES = (9, 9)
-
-
-def random_taps(rng, n, k, side):
-    directions = rng.normal(size=(n * k, 3))
-    directions[:, 2] = np.abs(directions[:, 2])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    nodes, weights = HemisphereGrid(side).taps(directions)
-    return nodes.reshape(n, k, 4), weights.reshape(n, k, 4)
-
-
-def random_weights(rng, n, k):
-    """A fifth zero, the others between 0.2 and 1."""
-    return (rng.uniform(0.2, 1, (n, k)) * (rng.random((n, k)) < 0.8)).astype(np.float32)
 
 
 def empty_samples(rng, n, n_views, n_lights, sides=SIDES, *, gaps=False):

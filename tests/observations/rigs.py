@@ -82,27 +82,29 @@ def write_samples(location, capture, samples):
     stored[:] = of_photographs(samples, pairs).astype(np.float16)
 
 
+def random_taps(rng, n, k, side):
+    directions = rng.normal(size=(n * k, 3))
+    directions[:, 2] = np.abs(directions[:, 2])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    nodes, weights = HemisphereGrid(side).taps(directions)
+    return nodes.reshape(n, k, 4), weights.reshape(n, k, 4)
+
+
+def random_weights(rng, n, k):
+    """A fifth zero, the others between 0.2 and 1."""
+    return (rng.uniform(0.2, 1, (n, k)) * (rng.random((n, k)) < 0.8)).astype(np.float32)
+
+
 def transformed(rng, n, n_views, n_lights, sides, *, pairs=None, values=None):
     """Samples in the domain at random directions with random weights, a fifth of them zero."""
-
-    def taps(k, side):
-        directions = rng.normal(size=(n * k, 3))
-        directions[:, 2] = np.abs(directions[:, 2])
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        nodes, weights = HemisphereGrid(side).taps(directions)
-        return nodes.reshape(n, k, 4), weights.reshape(n, k, 4)
-
-    def weights(k):
-        return (rng.uniform(0.2, 1, (n, k)) * (rng.random((n, k)) < 0.8)).astype(np.float32)
-
     if values is None:
         values = rng.normal(size=(n, n_views, n_lights, 3)).astype(np.float32)
     return TransformedSamples(
         values=values,
-        view_taps=taps(n_views, sides[0]),
-        light_taps=taps(n_lights, sides[1]),
-        view_weights=weights(n_views),
-        light_weights=weights(n_lights),
+        view_taps=random_taps(rng, n, n_views, sides[0]),
+        light_taps=random_taps(rng, n, n_lights, sides[1]),
+        view_weights=random_weights(rng, n, n_views),
+        light_weights=random_weights(rng, n, n_lights),
         pairs=np.ones((n_views, n_lights), np.float32) if pairs is None else pairs,
     )
 
