@@ -28,9 +28,9 @@ HEAVY = (
     *("open3d", "pandas", "sklearn", "plotly", "IPython"),
 )
 # What is imported when rays are traced.
-LATE = ("open3d.cpu.pybind", "scipy.ndimage", "scipy.spatial", "scipy.sparse")
+LATE = ("open3d.cpu.pybind", "cv2", "scipy.ndimage", "scipy.spatial", "scipy.sparse")
 HEAVIER = (
-    *(*HEAVY, *LATE, "cv2", "OpenImageIO", "PIL", "psutil"),
+    *(*HEAVY, *LATE, "OpenImageIO", "PIL", "psutil"),
     *("xatlas", "jsonschema", "fsspec", "flip_evaluator", "OpenEXR", "multiprocessing.pool"),
 )
 # Seconds of CPU time: six times what is asked for of an idle core, since work on the other

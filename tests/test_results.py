@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from benchmarks import make_results, measuring  # noqa: E402
 from test_layers import PACKAGES  # noqa: E402
 
-from reflfield.pipeline.stages import STAGES  # noqa: E402
+from reflfield.pipeline.stages import ORDER, STAGES  # noqa: E402
 
 README = ROOT / "README.md"
 PIPELINE = ROOT / "reflfield" / "pipeline" / "README.md"
@@ -95,6 +95,27 @@ def test_layers_of_the_page_are_those_of_the_code():
 
 def test_stages_of_the_page_are_those_of_the_code():
     assert names_in_table(PIPELINE.read_text()) == list(STAGES)
+
+
+def test_functions_of_the_stages_stand_where_the_page_says():
+    table = re.search(r"(^\|.*\n)+", PIPELINE.read_text(), re.MULTILINE).group()
+    linked = re.findall(r"\[(\w+)\]\((\S+\.py)\)", table)
+    sources = {link: (PIPELINE.parent / link).read_text() for _, link in linked}
+    missing = [
+        (name, link)
+        for name, link in linked
+        if not re.search(rf"^(def|class) {name}\b", sources[link], re.MULTILINE)
+    ]
+    assert linked
+    assert missing == []
+
+
+@pytest.mark.parametrize("stage", ORDER, ids=lambda stage: stage.name)
+def test_a_stage_begins_in_the_module_of_its_name(stage):
+    module = stage.compute.__module__.rpartition(".")[2]
+    elsewhere = {"model_selection": "stages"}
+    elsewhere |= dict.fromkeys((n for n in STAGES if n.startswith("surface_")), "surface")
+    assert module == elsewhere.get(stage.name, stage.name)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.parent.name)

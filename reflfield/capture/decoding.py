@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
@@ -28,7 +27,9 @@ from reflfield.capture.image_layers import Layer
 from reflfield.capture.stated_color import radiance_scale, stated_space
 from reflfield.errors import CaptureError
 from reflfield.util.files import utf8_name
+from reflfield.util.late_import import LateImport
 
+cv2: Any = LateImport("cv2")
 Float32 = NDArray[np.float32]
 
 FORMATS = {"exr": "openexr", "png": "png", "jpeg": "jpeg", "tiff": "tiff", "hdr": "hdr"}

@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.util.files import replacing, utf8_name
+from reflfield.util.late_import import LateImport
+
+cv2: Any = LateImport("cv2")
 
 
 def write_exr(

@@ -15,10 +15,15 @@ and its fisheye model, with ``theta = atan(r)`` and no other coefficients than k
 
 from __future__ import annotations
 
-import cv2
+from typing import Any
+
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
+
+from reflfield.util.late_import import LateImport
+
+cv2: Any = LateImport("cv2")  # of fisheye lenses alone
 
 Array = NDArray[np.float64]
 Coefficients = tuple[float, ...]

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-SLOW = ("dask", "distributed", "matplotlib", "open3d", "open3d.cpu.pybind", "pandas",
+SLOW = ("cv2", "dask", "distributed", "matplotlib", "open3d", "open3d.cpu.pybind", "pandas",
         "scipy.linalg", "skimage", "sklearn", "trimesh", "zarr")  # fmt: skip
 
 RENDERING = "reflfield.field.file, reflfield.render.renderer, reflfield.render.turntable"
