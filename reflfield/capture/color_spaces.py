@@ -196,7 +196,10 @@ def _curve(content: bytes) -> Float64:
 def _parametric(kind: int, g: float, *rest: float) -> Float64:
     """Values at `_STEPS` of a parametric curve (ICC.1:2022, table 68)."""
     a, b = rest[:2] if kind else (1.0, 0.0)
-    above = np.maximum(a * _STEPS + b, 0) ** g
+    with np.errstate(over="ignore", divide="ignore"):
+        above = np.maximum(a * _STEPS + b, 0) ** g
+    if not np.isfinite(above).all():
+        raise InputError(f"an ICC profile whose curve is not finite (exponent {g:g})")
     if kind in (0, 1, 2):
         offset = rest[2] if kind == 2 else 0.0
         start = -b / a if kind and a else 0.0
@@ -213,7 +216,7 @@ def _encoding(curve: Float64) -> Encoding:
     if np.abs(curve - _STEPS).max() < 1e-4:
         return Encoding("linear")
     half = curve[len(_STEPS) // 2]
-    gamma = float(np.log(half) / np.log(0.5)) if half > 0 else 1.0
+    gamma = float(np.log(half) / np.log(0.5)) if 0 < half < 1 else 1.0
     if np.abs(curve - _STEPS**gamma).max() < 1e-4:
         return Encoding("gamma", gamma=gamma)
     rising = np.r_[True, np.diff(np.maximum.accumulate(curve)) > 0]

@@ -292,6 +292,8 @@ def _jpeg(path: Path, file: IO[bytes]) -> ImageHeader:
         if fill != 0xFF or marker in (0xD9, 0xDA):
             break
         length = struct.unpack(">H", file.read(2))[0]
+        if length < 2:  # it counts itself
+            break
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             precision, height, width, channels = struct.unpack(">BHHB", file.read(6))
             if precision != 8 or channels not in (1, 3):

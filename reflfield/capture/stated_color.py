@@ -31,6 +31,8 @@ CICP_CURVES = {
     8: Encoding(LINEAR),
     13: Encoding(SRGB),
 }
+# Bytes of the chunks of a PNG that hold numbers.
+_SIZES = {b"cICP": 4, b"gAMA": 4, b"cHRM": 32}
 
 
 def stated_space(
@@ -112,6 +114,9 @@ def _profile_space(profile: bytes) -> ColorSpace:
 
 def _png_space(chunks: dict[bytes, bytes]) -> ColorSpace:
     """What comes first in the order of PNG (third edition): cICP, iCCP, sRGB, gAMA, cHRM."""
+    for name, n_bytes in _SIZES.items():
+        if len(chunks.get(name, bytes(n_bytes))) != n_bytes:
+            raise InputError(f"a chunk {name.decode()} that is not {n_bytes} bytes long")
     if b"cICP" in chunks:
         return _cicp_space(chunks[b"cICP"])
     if b"iCCP" in chunks:

@@ -66,6 +66,11 @@ def gamma_curve(exponent):
     return b"curv\0\0\0\0" + struct.pack(">IH", 1, round(exponent * 256))
 
 
+def power(exponent, factor=1.0):
+    """The parametric curve (factor x) ** exponent."""
+    return b"para\0\0\0\0\0\1\0\0" + b"".join(map(fixed, (exponent, factor, 0.0)))
+
+
 LINEAR_CURVE = b"curv\0\0\0\0" + struct.pack(">I", 0)
 
 
@@ -116,6 +121,9 @@ class TestPng:
             ((b"gAMA", struct.pack(">I", 1)), "gamma of 100000"),
             ((b"cHRM", bytes(32)), "chromaticities"),
             ((b"iCCP", b"x\0\0" + zlib.compress(b"no profile")), "profile"),
+            ((b"cICP", bytes([1, 13])), "cICP that is not 4 bytes"),
+            ((b"gAMA", b"\0"), "gAMA that is not 4 bytes"),
+            ((b"cHRM", bytes(31)), "cHRM that is not 32 bytes"),
         ],
     )
     def test_refused_with_the_remedy(self, tmp_path, chunk, reason):
@@ -187,6 +195,8 @@ class TestProfiles:
             (profile_of(REC709, LINEAR_CURVE, more=[(b"gTRC", gamma_curve(2))]),
              "'Test'.*different curves"),
             (profile_of(REC709, b"mft2\0\0\0\0"), "'Test'"),
+            (profile_of(REC709, power(-1.0)), "not finite"),
+            (profile_of(REC709, power(30_000.0, 2.0)), "not finite"),
             (b"\0" * 200, "damaged"),
         ],
     )  # fmt: skip

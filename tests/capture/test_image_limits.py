@@ -82,6 +82,12 @@ def jpeg_of_65500(path):
     path.write_bytes(content)
 
 
+def jpeg_with_a_segment_of_no_length(path):
+    """A segment of Exif data whose length, which counts itself, is 0."""
+    content = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    path.write_bytes(content[:2] + b"\xff\xe1\0\0Exif\0\0" + content[2:])
+
+
 def tiff_with(**more):
     def write(path):
         pixels = np.zeros((4, 4, 3), np.uint8)
@@ -110,6 +116,7 @@ def hdr_of_billions(path):
 HOSTILE = [
     wide, tall, shown_far_larger, far_larger_than_shown, upside_down, channels_by_the_thousand,
     parts_by_the_thousand, huge_attribute, png_bomb, png_of_billions, jpeg_of_65500,
+    jpeg_with_a_segment_of_no_length,
     tiff_with(t256=(4, [2**31]), t257=(4, [2**31])), tiff_with(t277=(3, [60_000])),
     tiff_with(t322=(4, [2**20]), t323=(4, [2**20])), tiff_in_a_circle, hdr_of_billions,
 ]  # fmt: skip
