@@ -15,6 +15,8 @@ from reflfield.util.quoting import listed
 # 16-bit files that hold sensors' codes as they are have at most 12 bits set, one in sixteen of
 # the range; encoded photographs reach that in any that is not nearly black.
 TWELVE_BITS = 4095
+# Those of 14 bits reach a quarter of the range, as very dark encoded photographs do, too.
+FOURTEEN_BITS = 16383
 # Photographs that are looked into before all are taken to be so; the first one usually tells.
 _MOST_LOOKED_INTO = 8
 # A dome's lamps stand about as far from the object as its cameras.
@@ -23,8 +25,13 @@ FARTHEST_LIGHTS = 100.0
 LARGEST_ASPECT = 1.5
 
 
-def check_code_range(capture: Capture) -> None:
+def check_code_range(capture: Capture) -> tuple[str, ...]:
     """Refuse linear codes of 12 bits that would be read as a dark sRGB of 16 bits.
+
+    Returns
+    -------
+    tuple of str
+        A note where they use 14 bits.
 
     Raises
     ------
@@ -38,16 +45,21 @@ def check_code_range(capture: Capture) -> None:
         photograph = capture.photographs[index]
         longest = max(photograph.exposures, key=lambda exposure: exposure.seconds)
         code = largest_code_of_16(longest.path, longest.reading)
-        if code is None or code > TWELVE_BITS:
-            return
+        if code is None or code > FOURTEEN_BITS:
+            return ()
         largest = max(largest, code)
-    if looked_into:
-        raise CaptureError(
-            f"{capture.photographs[0].path}: expected 16-bit photographs that use their range, "
-            f"received codes up to {largest} in all that were looked into "
-            f"({len(looked_into)}), as of a sensor of 12 bits; say `encoding='linear'` if "
-            "they are a sensor's values, `encoding='srgb'` if they are encoded and so dark"
-        )
+    if not looked_into:
+        return ()
+    bits = 12 if largest <= TWELVE_BITS else 14
+    text = (
+        f"{capture.photographs[0].path}: expected 16-bit photographs that use their range, "
+        f"received codes up to {largest} in all that were looked into "
+        f"({len(looked_into)}), as of a sensor of {bits} bits; say `encoding='linear'` if "
+        "they are a sensor's values, `encoding='srgb'` if they are encoded and so dark"
+    )
+    if bits == 12:
+        raise CaptureError(text)
+    return (text,)
 
 
 def far_lights(capture: Capture) -> tuple[str, ...]:
@@ -83,4 +95,22 @@ def oblong_pixels(capture: Capture) -> tuple[str, ...]:
         f"{capture.description}: fl_x and fl_y differ as if pixels were oblong in "
         f"{listed([camera.id for camera in oblong])} ({oblong[0].fl_x:.6g} and "
         f"{oblong[0].fl_y:.6g}); is that so?",
+    )
+
+
+def stray_principal_points(capture: Capture) -> tuple[str, ...]:
+    """A note on cameras whose principal point lies outside of their images."""
+    stray = [
+        camera
+        for camera in capture.cameras
+        if camera.kind != ORTHOGRAPHIC
+        and not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height)
+    ]
+    if not stray:
+        return ()
+    first = stray[0]
+    return (
+        f"{capture.description}: the principal point lies outside of the image in "
+        f"{listed([camera.id for camera in stray])} ({first.cx:.6g}, {first.cy:.6g} of "
+        f"{first.width} x {first.height} pixels); are photographs reduced or cropped?",
     )

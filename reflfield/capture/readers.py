@@ -23,7 +23,12 @@ from reflfield.capture.consistency import (
 from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.image_files import AS_STATED, ImageReading
 from reflfield.capture.light_table import light_table_of, with_lights
-from reflfield.capture.plausibility import check_code_range, far_lights, oblong_pixels
+from reflfield.capture.plausibility import (
+    check_code_range,
+    far_lights,
+    oblong_pixels,
+    stray_principal_points,
+)
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
 from reflfield.util.files import check_regular
@@ -97,8 +102,13 @@ def open_capture(
         check_lights(capture)
         check_poses(capture.cameras, capture.description)
         check_photographs(capture)
-        check_code_range(capture)
-        more = (*unphotographed(capture), *far_lights(capture), *oblong_pixels(capture))
+        more = (
+            *check_code_range(capture),
+            *unphotographed(capture),
+            *far_lights(capture),
+            *oblong_pixels(capture),
+            *stray_principal_points(capture),
+        )
         capture = replace(capture, notes=(*capture.notes, *more))
     for note in capture.notes:
         _logger.warning("%s", note)

@@ -35,19 +35,24 @@ _WITHOUT_EFFECT = {
 
 _UNDISTORT = "undistort the photographs first"
 _LIGHT = "give the light as 'pl_pos' and 'pl_intensity', or as 'environment'"
+_ENCODING = "say how files are encoded in 'encoding'"
 _VALUES = "write the photographs as they were measured, without it"
 # Names (regular expressions) of what changes geometry or values, and what to do about it.
 _REFUSED = tuple(
     (re.compile(names), remedy)
     for names, remedy in (
-        (r"b[12]|s[1-4]?|skew|k([7-9]|\d\d+)|p([03-9]|\d\d+)|tau\w*|ftheta_\w+", _UNDISTORT),
+        (r"b[12]|s[1-4]?|skew|sk_[xy]|k([7-9]|\d\d+)|p([03-9]|\d\d+)", _UNDISTORT),
+        (r"tau\w*|ftheta_\w+", _UNDISTORT),
         (r"dist(ortion)?(_(params|coeffs?|coefficients))?|(radial|tangential)_distortion",
          "name the coefficients k1, k2, p1, p2, k3"),
-        (r"latlong|equirectangular|panorama|(is_)?orthographic", _UNDISTORT),
-        (r"camera_type|projection(_type)?", _UNDISTORT),
-        (r"gamma|colou?r_?space|transfer_function", "say how files are encoded in 'encoding'"),
+        (r"(is_)?(latlong|equirectangular|spherical|panorama|orthographic)", _UNDISTORT),
+        (r"(camera|projection|lens|distortion)(_(type|model|mode))?", _UNDISTORT),
+        (r"((camera|pose|axis|coordinate)_)?(convention|system|frame)|coordinates|handedness",
+         "write 'transform_matrix' in OpenGL axes"),
+        (r"gamma|colou?r_?space|transfer_function|(is_)?linear", _ENCODING),
         (r"[xy]_fov|fov(_[xy])?|fov[xy]", "give 'camera_angle_x' in radians, or 'fl_x'"),
-        (r"f[xy]|focal(_length)?(_[xy])?", "give 'fl_x' and 'fl_y' in pixels"),
+        (r"f[xy]|focal(_length)?(_[xy])?|K|(cam_)?intrinsics?(_matrix)?|(camera|K)_matrix",
+         "give 'fl_x', 'fl_y', 'cx' and 'cy' in pixels"),
         (r"rolling_shutter\w*|transform_matrix_(start|end)|camera_\w+_velocity",
          "only cameras at rest are supported"),
         (r"[RT]_opt", "write the refined pose as 'transform_matrix'"),
@@ -59,11 +64,19 @@ _REFUSED = tuple(
     )
 )  # fmt: skip
 # Values of refused keys that change nothing.
-_NEUTRAL = (None, False, 0, "", "none", "perspective", "pinhole", "srgb")
+_NEUTRAL = (None, False, 0, "", "none", "perspective", "pinhole", "srgb", "opengl")
+_SRGB = re.compile(r"(is_)?srgb")
+# Frames of another time show an object that has moved.
+_TIME = re.compile(r"time(_id)?|warp_id")
 # Differences between frames in these are differences in values.
 _EXPOSURE = re.compile(
     r"exposure(_time|_value)?|shutter(_speed)?|iso|gain|ev|aperture|f_?number|white_balance"
 )
+
+_ONE_EXPOSURE = (
+    "bring the photographs to one exposure, or give 'exposures' with seconds in capture.json"
+)
+_ONE_TIME = "leave the frames of one time: objects that move are not supported"
 
 
 @dataclass(frozen=True)
@@ -116,8 +129,14 @@ def check_keys(common: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
             _refuse(key, remedy, frames)
         if key == "orientation_override":
             _refuse(key, "turn poses and lights before they are written", frames)
+        if _SRGB.fullmatch(key) and any(frame.get(key) is False for frame in frames):
+            raise CaptureError(
+                f"{frames[0].what}: {key}: expected true, received false; {_ENCODING}"
+            )
         if _EXPOSURE.fullmatch(key):
-            _check_same(key, frames)
+            _check_same(key, frames, _ONE_EXPOSURE)
+        if _TIME.fullmatch(key):
+            _check_same(key, frames, _ONE_TIME)
     _check_frame_count(common, len(frames), frames[0].what)
     unused = sorted(keys - _WITHOUT_EFFECT)
     if not unused:
@@ -145,15 +164,14 @@ def _is_neutral(value: Any) -> bool:
     return not isinstance(plain, dict) and plain in _NEUTRAL
 
 
-def _check_same(key: str, frames: Sequence[Frame]) -> None:
-    """Demand one exposure of all frames."""
+def _check_same(key: str, frames: Sequence[Frame], remedy: str) -> None:
+    """Demand one value of all frames."""
     first = frames[0].get(key)
     for frame in frames:
         if frame.get(key) != first:
             raise CaptureError(
                 f"{frame.what}: {key}: expected {quoted(first)} as in the first frame, "
-                f"received {quoted(frame.get(key))}; bring the photographs to one exposure, "
-                "or give 'exposures' with seconds in capture.json"
+                f"received {quoted(frame.get(key))}; {remedy}"
             )
 
 

@@ -38,7 +38,7 @@ MANY_MISSING = 0.1
 def description_findings(capture: Capture) -> Iterator[Finding]:
     """Findings on what the description says."""
     where = str(capture.description or capture.root)
-    refused: dict[str, Callable[[], None]] = {
+    refused: dict[str, Callable[[], tuple[str, ...] | None]] = {
         "environment map missing": lambda: check_environments(capture),
         "pairs of camera and light": lambda: check_pairs(capture),
         "light without light": lambda: check_lights(capture),
@@ -57,10 +57,11 @@ def code_range_finding(capture: Capture) -> Iterator[Finding]:
     yield from _refusal("encoding", lambda: check_code_range(capture))
 
 
-def _refusal(kind: str, check: Callable[[], None]) -> Iterator[Finding]:
-    """The error that a check of the reader raises, as a finding."""
+def _refusal(kind: str, check: Callable[[], tuple[str, ...] | None]) -> Iterator[Finding]:
+    """The error that a check raises, or the notes that it returns, as findings."""
     try:
-        check()
+        for note in check() or ():
+            yield Finding(kind, NOTE, (), note, "check that this is meant")
     except InputError as error:
         words, _, remedy = str(error).rpartition("; ")
         if not words:

@@ -62,13 +62,20 @@ class TestCodes:
         ("codes_of", "dtype"),
         [
             (lambda image: 16 * (4095 * image).round(), np.uint16),  # 12 bits at the top
-            (lambda image: 4200 * image, np.uint16),
+            (lambda image: 17_000 * image, np.uint16),
             (lambda image: 255 * image, np.uint8),
         ],
     )
     def test_other_codes_pass(self, frozen, codes_of, dtype):
         in_png(frozen, codes_of, dtype)
-        assert len(open_capture(frozen).photographs) > 0
+        assert not open_capture(frozen).notes
+
+    def test_codes_of_14_bits_are_noted(self, frozen):
+        in_png(frozen, lambda image: 16_383 * image)
+        (note,) = open_capture(frozen).notes
+        assert "16383 in all" in note
+        assert "14 bits; say `encoding='linear'`" in note
+        assert not open_capture(frozen, reading=LINEAR).notes
 
 
 def same_file_twice(document):
@@ -116,3 +123,11 @@ def test_oblong_pixels_are_noted(frozen, factor, n_notes):
     described(frozen, stretch)
     notes = [note for note in open_capture(frozen).notes if "oblong in v000" in note]
     assert len(notes) == n_notes
+
+
+@pytest.mark.parametrize(("cx", "n_notes"), [(0.0, 0), (9_000.0, 1), (-1.0, 1)])
+def test_principal_points_outside_of_the_image_are_noted(frozen, cx, n_notes):
+    described(frozen, lambda document: document["cameras"][1].update(cx=cx))
+    notes = [note for note in open_capture(frozen).notes if "outside of the image in" in note]
+    assert len(notes) == n_notes
+    assert all("image in v001 (" in note for note in notes)

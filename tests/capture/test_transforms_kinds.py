@@ -260,6 +260,15 @@ class TestKeys:
             ("white_transparent", True),
             ("driver_parameters", {"LightX": 1.0}),
             ("envmap", "sky.exr"),
+            ("sk_x", 0.1),
+            ("is_equirectangular", True),
+            ("lens", "fisheye"),
+            ("distortion_model", "division"),
+            ("coordinate_system", "opencv"),
+            ("camera_convention", "OpenCV"),
+            ("K", np.eye(3).tolist()),
+            ("intrinsic_matrix", np.eye(3).tolist()),
+            ("is_linear", True),
         ],
     )
     @pytest.mark.parametrize("place", ["frame", "top"])
@@ -273,7 +282,9 @@ class TestKeys:
 
     def test_values_that_change_nothing_pass(self, tmp_path):
         neutral = {"b1": 0, "b2": 0.0, "rolling_shutter": [0, 0, 0, 0], "skew": None,
-                   "white_transparent": False, "orientation_override": "none"}  # fmt: skip
+                   "white_transparent": False, "orientation_override": "none", "lens": None,
+                   "coordinate_system": "OpenGL", "is_linear": False, "srgb": True,
+                   "time": 0.5}  # fmt: skip
         assert opened(tmp_path, [frame("a", **neutral)]).n_views == 1
 
     def test_one_exposure_for_all_frames(self, tmp_path):
@@ -281,6 +292,15 @@ class TestKeys:
         with pytest.raises(CaptureError, match=r"frame 1 \('b'\): exposure_time: expected 0.1"):
             opened(tmp_path, frames)
         assert opened(tmp_path, [frame("a", iso=100), frame("b", iso=100)]).n_lights == 1
+
+    def test_one_time_for_all_frames(self, tmp_path):
+        frames = [frame("a", time=0.0), frame("b", time=0.5)]
+        with pytest.raises(CaptureError, match=r"frame 1 \('b'\): time: expected 0.0.* move"):
+            opened(tmp_path, frames)
+
+    def test_photographs_that_are_said_not_to_be_srgb(self, tmp_path):
+        with pytest.raises(CaptureError, match=r"srgb: expected true.*'encoding'"):
+            opened(tmp_path, [frame("a"), frame("b", srgb=False)])
 
     def test_frames_that_the_file_counts_out(self, tmp_path):
         top = {"fl_x": 10.0, "w": 8, "h": 6, "n_frames": 1}
