@@ -166,8 +166,9 @@ class Capture:
                 f"{self.name}: base_geometry: expected 'hull' or 'plane', "
                 f"received {self.base_geometry!r}"
             )
-        _check_unique("camera", [c.id for c in self.cameras])
-        _check_unique("light", [light.id for light in self.lights])
+        where = f"{self.description}: " if self.description else ""
+        _check_unique(f"{where}cameras", [c.id for c in self.cameras])
+        _check_unique(f"{where}lights", [light.id for light in self.lights])
         for photograph in self.photographs:
             _check_indices(photograph, self.n_views, self.n_lights)
 
@@ -452,7 +453,7 @@ def _check_unique(what: str, ids: Sequence[str]) -> None:
     seen: set[str] = set()
     for id_ in ids:
         if id_ in seen:
-            raise CaptureError(f"duplicate {what} id {id_!r}; ids must be unique")
+            raise CaptureError(f"{what}: expected ids that differ, received {id_!r} twice")
         seen.add(id_)
 
 

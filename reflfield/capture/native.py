@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
@@ -32,6 +33,11 @@ FORMAT = "reflfield-capture"
 VERSION = 1
 # Faults of a description that are looked at to find the most telling one.
 FAULTS_COMPARED = 50
+# Keys at the top that would change geometry or values if anything read them.
+_WOULD_CHANGE = re.compile(
+    r"((world|scene)_)?scale|(length_)?units?|gamma|colou?r_?space|(is_)?(linear|srgb)"
+    r"|axes|((camera|pose|coordinate)_)?(convention|system|frame)|white_balance|exposure"
+)
 
 
 def read_native(description: Path, *, follow_links: bool = False) -> Capture:
@@ -216,6 +222,13 @@ def _notes(document: Mapping[str, Any], description: Path) -> tuple[str, ...]:
         raise CaptureError(
             f"{description}: {misplaced[0]}: expected within a camera, light or photograph, "
             "received it at the top, where it would be without effect; move it there"
+        )
+    changing = next((key for key in unused if _WOULD_CHANGE.fullmatch(key)), None)
+    if changing:
+        raise CaptureError(
+            f"{description}: {changing}: expected no such key, received "
+            f"{quoted(document[changing])}, which nothing would apply; apply it to cameras, "
+            "lights and photographs, or say how they are encoded in 'encoding'"
         )
     listed = ", ".join(quoted(key) for key in unused[:20])
     return (f"{description}: not used: {listed}",) if unused else ()

@@ -111,6 +111,12 @@ def test_keys_of_cameras_and_lights_at_the_top(opened, key):
         opened(lambda document: document.update({key: 1}))
 
 
+@pytest.mark.parametrize("key", ["scale", "unit", "coordinate_system", "gamma", "linear"])
+def test_keys_at_the_top_that_nothing_would_apply(opened, key):
+    with pytest.raises(CaptureError, match=rf"capture\.json: {key}: expected no such key"):
+        opened(lambda document: document.update({key: 2.0}))
+
+
 def test_other_keys_at_the_top_are_noted(opened):
     capture = opened(lambda document: document.update(owner="me", mood=1))
     assert capture.notes == (f"{capture.description}: not used: 'mood', 'owner'",)

@@ -147,9 +147,15 @@ class TestNative:
             (lambda d: d.update(cameras=[]), "cameras"),
             (lambda d: d["cameras"][0].update(fl_x="wide"), r"cameras\[0\]\.fl_x"),
             (lambda d: d["cameras"][0].update(focal=1), r"cameras\[0\].*'focal'"),
-            (lambda d: d["cameras"][1].update(id="v000"), "duplicate camera id 'v000'"),
+            (
+                lambda d: d["cameras"][1].update(id="v000"),
+                r"capture\.json: cameras: .*'v000' twice",
+            ),
             (lambda d: d["cameras"][1].update(id="../x"), r"cameras\[1\]\.id"),
-            (lambda d: d["lights"][1].update(id="l000"), "duplicate light id 'l000'"),
+            (
+                lambda d: d["lights"][1].update(id="l000"),
+                r"capture\.json: lights: .*'l000' twice",
+            ),
             (lambda d: d["lights"][0].pop("position"), r"lights\[0\].*position"),
             (lambda d: d["lights"][0].update(intensity=[1, 1, -1]), r"lights\[0\]\.intensity"),
             (

@@ -128,7 +128,7 @@ class TestDescription:
 
         described(capture_copy, spoil)
         outcome = run_tiny(tmp_path / "out", capture=capture_copy)
-        refused(outcome, "duplicate", f"{what[:-1]} id", out=tmp_path / "out")
+        refused(outcome, "capture.json", what, "twice", out=tmp_path / "out")
 
     @pytest.mark.parametrize("path", ["../outside.png", "/etc/hostname"])
     def test_path_that_leaves(self, capture_copy, described, run_tiny, refused, tmp_path, path):
