@@ -50,9 +50,17 @@ class Reader:
 
     def descriptions(self, folder: Path) -> list[Path]:
         """Files in a folder that are of this format."""
-        files = (path for pattern in self.patterns for path in sorted(folder.glob(pattern)))
+        patterns = (_of_either_case(pattern) for pattern in self.patterns)
+        files = (path for pattern in patterns for path in sorted(folder.glob(pattern)))
         fitting = (path for path in files if not path.is_dir() and self.recognises(path))
         return list(islice(fitting, 1 if self.by_one_of_many else None))
+
+
+def _of_either_case(pattern: str) -> str:
+    """A glob of a suffix that fits it in capital letters, too, as some systems write it."""
+    if not pattern.startswith("*.") or "[" in pattern:
+        return pattern
+    return "".join(f"[{c.lower()}{c.upper()}]" if c.isalpha() else c for c in pattern)
 
 
 def _any(path: Path) -> bool:

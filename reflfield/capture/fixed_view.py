@@ -28,6 +28,8 @@ CAMERA_HEIGHT = 10.0  # metres above the plane; only a sign for an orthographic 
 # mean something else.
 LOWEST = 0.05
 MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearly level
+# Longest of directions over the shortest; those of one length are rounded.
+MOST_UNEQUAL = 1.1
 # Words of files that lie beside photographs and are none.
 _OTHER_IMAGES = re.compile(r"mask|normals?|gt|ref|depth|albedo|dark|ambient|preview|thumb")
 _MASK = re.compile(r"mask")
@@ -150,6 +152,20 @@ def notes_on_lights_behind(
     return (
         f"{description}: {behind} of {len(directions)} lights are behind the image plane "
         "(z <= 0); their photographs show nothing of it",
+    )
+
+
+def notes_on_lengths(
+    directions: Sequence[Sequence[float]], description: Path
+) -> tuple[str, ...]:
+    """A note on directions whose lengths differ, as those of positions do."""
+    lengths = [math.hypot(*direction) for direction in directions]
+    if max(lengths) <= MOST_UNEQUAL * min(lengths):
+        return ()
+    return (
+        f"{description}: light directions have lengths of {min(lengths):.4g} to "
+        f"{max(lengths):.4g}, which count for nothing; if they are positions of near lights, "
+        "write them in a .dome of relight or in lights.csv, if intensities, in capture.json",
     )
 
 

@@ -22,6 +22,7 @@ from reflfield.capture.documents import check_counts, parse_count, parse_number,
 from reflfield.capture.fixed_view import (
     FixedView,
     fixed_view_capture,
+    notes_on_lengths,
     notes_on_lights_behind,
     orthographic_camera,
 )
@@ -71,7 +72,11 @@ def read_lp(description: Path, *, follow_links: bool = False) -> Capture:
     lights = [
         Light("l", "directional", direction=np.array(direction)) for _, direction in parsed
     ]
-    notes = notes_on_lights_behind([direction for _, direction in parsed], description)
+    directions = [direction for _, direction in parsed]
+    notes = (
+        *notes_on_lights_behind(directions, description),
+        *notes_on_lengths(directions, description),
+    )
     return fixed_view_capture(
         FixedView(tuple(paths), mask=None),
         lights,

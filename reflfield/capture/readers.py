@@ -165,10 +165,13 @@ def _descriptions(
 
 def _kind_of_file(path: Path) -> str:
     """Format of a description file, by its name and by what it holds."""
-    for name, reader in OTHER_READERS.items():
+    for format_name, reader in OTHER_READERS.items():
         ends = {pattern.rpartition("/")[2] for pattern in reader.patterns}
-        if any(fnmatch(path.name, end) for end in ends) and reader.recognises(path):
-            return name
+        fits = any(
+            fnmatch(name, end) for end in ends for name in (path.name, path.name.lower())
+        )
+        if fits and reader.recognises(path):
+            return format_name
     text = read_text(path)
     if text.lstrip().startswith("{"):
         document = read_json(path)

@@ -398,6 +398,11 @@ class TestDetection:
         (native / "capture.json").rename(path)
         assert open_capture(path).format == "native"
 
+    def test_suffixes_in_capital_letters(self, tmp_path):
+        write_png(tmp_path / "a.png", np.full((4, 4, 3), 99, np.uint8))
+        (tmp_path / "LIGHTS.LP").write_text("1\na.png 0 0 1\n")
+        assert open_capture(tmp_path).format == "lp"
+
     def test_two_descriptions_ask_for_one(self, native):
         frame = {"file_path": "photographs/v000_l000.exr", "pl_pos": [0, 0, 1]}
         pose = {"transform_matrix": np.eye(4).tolist(), "fl_x": 10.0}

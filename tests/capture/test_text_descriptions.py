@@ -87,6 +87,14 @@ class TestLp:
         note = self.opened(tmp_path, *lines).notes[0]
         assert "dome.lp: 1 of 8 lights are behind the image plane" in note
 
+    @pytest.mark.parametrize(("factor", "n_notes"), [(1.05, 0), (2.0, 1)])
+    def test_directions_of_different_lengths_are_noted(self, tmp_path, factor, n_notes):
+        photograph(tmp_path / "0.png")
+        photograph(tmp_path / "1.png")
+        notes = self.opened(tmp_path, "0.png 0 0 3", f"1.png 0 0 {3 * factor}").notes
+        assert len(notes) == n_notes
+        assert all("lengths of 3 to 6, which count for nothing" in note for note in notes)
+
     def test_nothing_of_the_name_here(self, tmp_path):
         photograph(tmp_path / "jpeg-exports/1.png")
         with pytest.raises(CaptureError, match=r"leaves the folder.*the description into a"):
