@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +66,8 @@ def make_masks(
     capture : Capture, Path or str
         Of several views.
     out : Path or str
-        Folder; gets NAME.png of each view, named as its first photograph.
+        Folder; gets NAME.png of each view, named as its first photograph within the folder of
+        all photographs. Masks there that this function did not write stay as they are.
     backdrop : sequence of str
         Colours of the backdrop as sRGB, ``d8d6da`` in hexadecimal digits.
     clean_plate : Path, optional
@@ -79,7 +81,8 @@ def make_masks(
     Raises
     ------
     InputError
-        If the capture has one view, a colour cannot be read, or a plate is missing.
+        If the capture has one view, a colour cannot be read, a plate is missing, or other
+        masks are in the way.
     GeometryError
         If the first masks have no common hull.
     """
@@ -98,11 +101,13 @@ def make_masks(
     stated = parse_encoding(encoding) if encoding is not None else None
     views = _Views(capture, clean_plate, ImageReading(encoding=stated))
     plate = views.plate if clean_plate is not None else None
-    masks = guided_masks(capture.cameras, views.photograph, options, plate)
     names = [views.name(i) for i in range(capture.n_views)]
     out = Path(out)
+    _refuse_other_masks(out, names)
+    masks = guided_masks(capture.cameras, views.photograph, options, plate)
     with filling(out) as folder:
         for name, mask in zip(names, masks, strict=True):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_png(folder / f"{name}.png", mask.covered.astype(np.uint8) * np.uint8(255))
         scores = {name: round(mask.score, 4) for name, mask in zip(names, masks, strict=True)}
         (folder / SCORES).write_text(json.dumps(scores, indent=1) + "\n")
@@ -110,6 +115,31 @@ def make_masks(
         MadeMask(camera.id, out / f"{name}.png", mask.score, mask.is_doubtful)
         for camera, name, mask in zip(capture.cameras, names, masks, strict=True)
     ]
+
+
+def _refuse_other_masks(out: Path, names: Sequence[str]) -> None:
+    """Refuse names that two views share, and masks that were made or corrected by others."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(
+            f"capture: expected photographs whose names differ without their suffixes, "
+            f"received two views {twice!r}; rename one"
+        )
+    scores = out / SCORES
+    there = [path for name in names if (path := out / f"{name}.png").exists()]
+    if scores.is_file():
+        written, own = scores.stat().st_mtime_ns, scores.read_text(errors="replace")
+        there = [
+            path
+            for path in there
+            if path.stat().st_mtime_ns > written
+            or json.dumps(path.relative_to(out).with_suffix("").as_posix()) not in own
+        ]
+    if there:
+        raise InputError(
+            f"{there[0]}: expected no mask, or one as this command left it, received another "
+            f"({len(there)} of {len(names)}); choose another folder, or remove it"
+        )
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:
@@ -147,8 +177,11 @@ class _Views:
         return indices[:: -(-len(indices) // MOST_PHOTOGRAPHS)]
 
     def name(self, view: int) -> str:
-        """Stem of the file of the first photograph of a view."""
-        return self.capture.photographs[self._photographs(view)[0]].path.stem
+        """Path of the first photograph of a view, without suffix, in the folder of all."""
+        paths = [photograph.path for photograph in self.capture.photographs]
+        folder = os.path.commonpath([path.parent for path in paths])
+        first = paths[self._photographs(view)[0]]
+        return first.relative_to(folder).with_suffix("").as_posix()
 
     def photograph(self, view: int) -> NDArray[np.float32]:
         """Mean of some photographs of a view, linear."""
@@ -161,7 +194,7 @@ class _Views:
         path = self.plates
         assert path is not None
         if path.is_dir():
-            stems = (self.name(view), self.capture.cameras[view].id)
+            stems = (Path(self.name(view)).name, self.capture.cameras[view].id)
             fitting = sorted(p for p in path.iterdir() if p.stem in stems and p.is_file())
             if not fitting:
                 raise InputError(

@@ -1,10 +1,16 @@
 """Masks by the hull of all: a ball on a cloth before a table, of named colours or a plate."""
 
+import os
+
 import numpy as np
 import pytest
 
-from reflfield.api.masks import make_masks, parse_colour
+from reflfield.api.masks import SCORES, make_masks, parse_colour
 from reflfield.capture.cameras import Camera
+from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.image_files import read_coverage
+from reflfield.capture.image_writing import write_exr
+from reflfield.capture.lights import Light
 from reflfield.errors import InputError, ShapeError
 from reflfield.geometry import guided_masks as guided_masks_module
 from reflfield.geometry.guided_masks import (
@@ -138,9 +144,54 @@ def test_flat_samples_are_refused(shared_data, tmp_path):
     assert not (tmp_path / "masks").exists()
 
 
+@pytest.fixture
+def folders_of_views(scene, tmp_path):
+    """A capture whose photographs are named alike, a folder for each view."""
+    views, _, photographs, _ = scene
+    entries = []
+    for view, photograph in zip(views, photographs, strict=True):
+        path = tmp_path / "images" / view.id / "0001.exr"
+        path.parent.mkdir(parents=True)
+        write_exr(path, photograph)
+        entries.append(Photograph("x", len(entries), 0, (Exposure(path, 1.0),)))
+    return Capture(
+        name="ball",
+        root=tmp_path,
+        cameras=tuple(views),
+        lights=(Light("l", "unknown"),),
+        photographs=tuple(entries),
+        silhouettes=(None,) * len(views),
+    )
+
+
+def test_photographs_of_one_name_in_folders_of_views(folders_of_views, scene, tmp_path):
+    masks = make_masks(
+        folders_of_views, tmp_path / "masks", backdrop=["40894f", "e8e8e8"], rounds=1
+    )
+    for mask, view, covered in zip(masks, scene[0], scene[1], strict=True):
+        assert mask.path == tmp_path / "masks" / view.id / "0001.png"
+        assert overlap(read_coverage(mask.path) > 0.5, covered > 0.5) > 0.8
+
+
+def test_masks_of_others_stay(folders_of_views, tmp_path):
+    out = tmp_path / "masks"
+    own = out / "v3" / "0001.png"
+    own.parent.mkdir(parents=True)
+    own.write_bytes(b"by hand")
+    with pytest.raises(InputError, match=r"v3/0001\.png: expected no mask, .* \(1 of 6\)"):
+        make_masks(folders_of_views, out, backdrop=["40894f", "e8e8e8"], rounds=1)
+    assert own.read_bytes() == b"by hand"
+    own.unlink()
+    for _ in range(2):  # its own are made anew
+        make_masks(folders_of_views, out, backdrop=["40894f", "e8e8e8"], rounds=1)
+    later = (out / SCORES).stat().st_mtime_ns + 10**9
+    os.utime(own, ns=(later, later))
+    with pytest.raises(InputError, match="as this command left it"):
+        make_masks(folders_of_views, out, backdrop=["40894f", "e8e8e8"], rounds=1)
+
+
 @pytest.mark.slow
 def test_ethiopian_head_without_its_masks(shared_data, tmp_path):
-    from reflfield.capture.image_files import read_coverage
     from reflfield.capture.readers import open_capture
 
     capture = open_capture(shared_data("ethiopian_head_masks"))
