@@ -28,6 +28,7 @@ from reflfield.field.half_vector import (
 )
 from reflfield.field.half_vector_build import build_half_vector_field
 from reflfield.sphere.hemisphere import softened_cosine
+from tests.field.test_fuzz_file import with_array
 
 N_TEXELS = 6
 
@@ -40,6 +41,10 @@ def directions(rng, n):
 
 @pytest.fixture
 def model():
+    return random_model()
+
+
+def random_model():
     rng = np.random.default_rng(5)
     normal = directions(rng, N_TEXELS).astype(np.float64) + np.array([0, 0, 2])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -215,6 +220,39 @@ def test_an_unknown_model_is_refused(model, tmp_path):
     with_header(tmp_path / "new.rfld", tmp_path / "other.rfld", model="splines")
     with pytest.raises(FieldFileError, match="model: expected one of"):
         open_field(tmp_path / "other.rfld")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A field file and its arrays."""
+    path = tmp_path_factory.mktemp("written") / "field.rfld"
+    write_field(path, built(random_model(), 0.01))
+    return path.read_bytes(), dict(open_field(path).arrays)
+
+
+@pytest.mark.parametrize("name", HALF_VECTOR_ARRAYS)
+def test_numbers_that_are_none_are_one_error_or_finite_samples(written, tmp_path, name):
+    """Arrays of evil values under checksums that fit them, as of a hostile writer."""
+    path = tmp_path / "field.rfld"
+    texels, views, lights = pairs(60)
+    content, arrays = written
+    if arrays[name].dtype.kind == "f":
+        values = (0, -1, np.nan, np.inf, np.finfo(np.float32).max, 1e-45, 1e30)
+    else:
+        limits = np.iinfo(arrays[name].dtype)
+        values = (0, 1, limits.max, limits.min)
+    for value in values:
+        path.write_bytes(content)
+        with_array(path, name, np.full_like(arrays[name], value))
+        try:
+            samples = evaluate(open_field(path), texels, views, lights)
+        except FieldFileError as error:
+            samples, message = np.zeros(1), str(error)
+        else:
+            message = str(path)
+        assert message.startswith(str(path))
+        assert np.isfinite(samples).all(), value
+        assert (samples >= 0).all(), value
 
 
 def test_files_of_version_4_have_lobes_without_skews(model, tmp_path):
