@@ -65,27 +65,47 @@ def _facing(normal: Any, view: Any) -> Any:
     return normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _terms(normal: Any, view: Any, light: Any, parts: Any, slopes: Any) -> None:
-    """What each weight adds under a light, into `parts`; slopes by n.l and n.h apart."""
-    cosine = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
-    if cosine <= _ZERO:
-        parts[:] = _ZERO
-        slopes[:] = _ZERO
-        return
-    towards = max(_facing(normal, view), LEAST_COSINE)
-    hx, hy, hz = light[0] + view[0], light[1] + view[1], light[2] + view[2]
-    scale = _ONE / np.sqrt(hx * hx + hy * hy + hz * hz + np.float32(1e-12))
-    half = (normal[0] * hx + normal[1] * hy + normal[2] * hz) * scale
-    parts[0], slopes[0, 0], slopes[0, 1] = cosine, _ONE, _ZERO
-    spread = np.float32(0.25) / (cosine + towards - cosine * towards + np.float32(1e-3))
-    for k in range(len(_ALPHA2)):
-        alpha2 = _ALPHA2[k]
-        rest = half * half * (alpha2 - _ONE) + _ONE
-        lobe = spread * alpha2 / (rest * rest)
-        parts[1 + k] = cosine * lobe
-        slopes[1 + k, 0] = lobe
-        slopes[1 + k, 1] = parts[1 + k] * np.float32(4.0) * half * (_ONE - alpha2) / rest
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _take_samples(values: Any, lights: Any, view: Any, samples: Any) -> None:
+    """One texel's values, which of them count, its lights and half vectors, as rows.
+
+    All loops over lights run along rows, so that the compiler takes several lights at a time.
+    """
+    own, counted, towards, halves = samples
+    for j in range(len(values)):
+        measured = not np.isnan(values[j])
+        own[j] = values[j] if measured else _ZERO
+        counted[j] = _ONE if measured else _ZERO
+    for j in range(len(values)):
+        x, y, z = lights[j, 0], lights[j, 1], lights[j, 2]
+        hx, hy, hz = x + view[0], y + view[1], z + view[2]
+        scale = _ONE / np.sqrt(hx * hx + hy * hy + hz * hz + np.float32(1e-12))
+        towards[0, j], towards[1, j], towards[2, j] = x, y, z
+        halves[0, j], halves[1, j], halves[2, j] = hx * scale, hy * scale, hz * scale
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _terms(normal: Any, view: Any, samples: Any, parts: Any, slopes: Any) -> None:
+    """What each weight adds under each light, into `parts`; slopes by n.l and n.h apart."""
+    _, _, towards, halves = samples
+    facing = max(_facing(normal, view), LEAST_COSINE)
+    for j in range(towards.shape[1]):
+        cosine = (
+            normal[0] * towards[0, j] + normal[1] * towards[1, j] + normal[2] * towards[2, j]
+        )
+        half = normal[0] * halves[0, j] + normal[1] * halves[1, j] + normal[2] * halves[2, j]
+        lit = _ONE if cosine > _ZERO else _ZERO
+        cosine = max(cosine, _ZERO)
+        parts[0, j], slopes[0, 0, j], slopes[0, 1, j] = cosine, lit, _ZERO
+        spread = lit * np.float32(0.25) / (cosine + facing - cosine * facing + np.float32(1e-3))
+        for k in range(len(_ALPHA2)):
+            alpha2 = _ALPHA2[k]
+            over = _ONE / (half * half * (alpha2 - _ONE) + _ONE)
+            lobe = spread * alpha2 * over * over
+            steepness = np.float32(4.0) * half * (_ONE - alpha2) * over
+            parts[1 + k, j] = cosine * lobe
+            slopes[1 + k, 0, j] = lobe
+            slopes[1 + k, 1, j] = cosine * lobe * steepness
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -110,44 +130,60 @@ def _trust(value: Any, shown: Any, unit: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _step(
-    values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int
-) -> Any:
+def _lines(samples: Any, weights: Any, axes: Any, room: Any) -> None:
+    """Values shown, and their derivatives by the two tilts, into the last rows of `parts`."""
+    _, _, towards, halves = samples
+    parts, slopes, shown = room[0], room[1], room[4]
+    tangent, binormal = axes
+    n = len(weights)
+    for j in range(len(shown)):
+        value, by_light, by_half = _ZERO, _ZERO, _ZERO
+        for k in range(N_WEIGHTS):
+            value += weights[k] * parts[k, j]
+            by_light += weights[k] * slopes[k, 0, j]
+            by_half += weights[k] * slopes[k, 1, j]
+        x = by_light * towards[0, j] + by_half * halves[0, j]
+        y = by_light * towards[1, j] + by_half * halves[1, j]
+        z = by_light * towards[2, j] + by_half * halves[2, j]
+        shown[j] = value
+        parts[n, j] = x * tangent[0] + y * tangent[1] + z * tangent[2]
+        parts[n + 1, j] = x * binormal[0] + y * binormal[1] + z * binormal[2]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _normal_equations(own: Any, trusts: Any, shown: Any, parts: Any, sums: Any) -> Any:
+    """Lower triangle and right side of the rows of `parts`; the weighted sum of squares."""
+    matrix, right = sums
+    error = _ZERO
+    for j in range(len(own)):
+        rest = own[j] - shown[j]
+        error += trusts[j] * rest * rest
+        shown[j] = trusts[j] * rest
+    for k in range(len(right)):
+        total = _ZERO
+        for j in range(len(own)):
+            total += parts[k, j] * shown[j]
+        right[k] = total
+        for m in range(k + 1):
+            total = _ZERO
+            for j in range(len(own)):
+                total += trusts[j] * parts[k, j] * parts[m, j]
+            matrix[k, m] = total
+    return error
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _step(samples: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int) -> Any:
     """Improve normal and weights once; sum of squares before, and the angle moved."""
     normal, weights = state
-    parts, slopes, matrix, right = room
-    n = len(weights)
+    own, counted, _, _ = samples
+    parts, slopes, matrix, right, shown, trusts = room
     tangent, binormal = _tangents(normal)
-    matrix[:] = 0.0
-    right[:] = 0.0
-    line = np.zeros(n + 2, np.float32)
-    error = 0.0
-    for j in range(len(values)):
-        if np.isnan(values[j]):
-            continue
-        light = lights[j]
-        _terms(normal, view, light, parts, slopes)
-        shown, by_light, by_half = _ZERO, _ZERO, _ZERO
-        for k in range(n):
-            line[k] = parts[k]
-            shown += weights[k] * parts[k]
-            by_light += weights[k] * slopes[k, 0]
-            by_half += weights[k] * slopes[k, 1]
-        hx, hy, hz = light[0] + view[0], light[1] + view[1], light[2] + view[2]
-        scale = by_half / np.sqrt(hx * hx + hy * hy + hz * hz + np.float32(1e-12))
-        line[n], line[n + 1] = _ZERO, _ZERO
-        for d in range(3):
-            slope = by_light * light[d] + scale * (light[d] + view[d])
-            line[n] += slope * tangent[d]
-            line[n + 1] += slope * binormal[d]
-        trust = _trust(values[j], shown, unit)
-        rest = values[j] - shown
-        error += trust * rest * rest
-        for k in range(n + 2):
-            scaled = trust * line[k]
-            right[k] += scaled * rest
-            for m in range(k + 1):
-                matrix[k, m] += scaled * line[m]
+    _terms(normal, view, samples, parts, slopes)
+    _lines(samples, weights, (tangent, binormal), room)
+    for j in range(len(own)):
+        trusts[j] = counted[j] * _trust(own[j], shown[j], unit)
+    error = _normal_equations(own, trusts, shown, parts, (matrix, right))
     return error, _move(state, tangent, binormal, matrix, right, n_free)
 
 
@@ -239,28 +275,24 @@ def _mirror_normal(values: Any, lights: Any, view: Any, least: Any, normal: Any)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _start_weights(
-    values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any
-) -> Any:
+def _start_weights(samples: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
     """Set the weights that fit best at a normal; the sum of squares that they leave."""
     normal, weights = state
-    parts, slopes, matrix, right = room
+    own, counted, _, _ = samples
+    parts, slopes, matrix, right, shown, trusts = room
     n = len(weights)
-    matrix[:] = 0.0
-    right[:] = 0.0
-    error = 0.0
-    for j in range(len(values)):
-        if np.isnan(values[j]):
-            continue
-        _terms(normal, view, lights[j], parts, slopes)
-        trust = _ONE / (np.float32(2.0) * max(values[j], _ZERO) + np.float32(0.02) * unit)
-        error += trust * values[j] * values[j]
-        for k in range(n):
-            right[k] += trust * parts[k] * values[j]
-            for m in range(n):
-                matrix[k, m] += trust * parts[k] * parts[m]
+    _terms(normal, view, samples, parts, slopes)
+    for j in range(len(own)):
+        shown[j] = _ZERO
+        spread = np.float32(2.0) * max(own[j], _ZERO) + np.float32(0.02) * unit
+        trusts[j] = counted[j] / spread
+    sums = matrix[:n, :n], right[:n]
+    error = _normal_equations(own, trusts, shown, parts, sums)
+    for k in range(n):
+        for m in range(k):
+            matrix[m, k] = matrix[k, m]
     weights[:] = _ZERO
-    _solve_weights(matrix, right, weights)
+    _solve_weights(*sums, weights)
     for k in range(n):
         error -= weights[k] * right[k]
     return error
@@ -277,41 +309,38 @@ def _brightest(values: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _best_start(values: Any, lights: Any, view: Any, unit: Any, states: Any, room: Any) -> int:
+def _best_start(samples: Any, view: Any, unit: Any, states: Any, room: Any) -> int:
     """Beginning with the least error; -1 if none faces the camera."""
     starts, weights = states
     best, least = -1, np.inf
     for s in range(len(starts)):
         if _facing(starts[s], view) < LEAST_COSINE:
             continue
-        state = starts[s], weights[s]
-        error = _start_weights(values, lights, view, unit, state, room)
+        error = _start_weights(samples, view, unit, (starts[s], weights[s]), room)
         if error < least:
             best, least = s, error
     return best
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _converge(
-    values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int
-) -> Any:
+def _converge(samples: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int) -> Any:
     """Take steps until they are small; the sum of squares before the last."""
-    moved, step, error = np.inf, 0, 0.0
+    moved, step, error = np.inf, 0, _ZERO
     while moved >= SMALL_STEP and step < MOST_STEPS:
-        error, moved = _step(values, lights, view, unit, state, room, n_free)
+        error, moved = _step(samples, view, unit, state, room, n_free)
         step += 1
     return error
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _matt_fit(values: Any, lights: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
+def _matt_fit(samples: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
     """Fit of the matt part alone from the normal of a matt surface; its sum of squares."""
     normal, weights = state
     if _facing(normal, view) < LEAST_COSINE:
-        return np.inf
-    _start_weights(values, lights, view, unit, state, room)
+        return np.float32(np.inf)
+    _start_weights(samples, view, unit, state, room)
     weights[1:] = _ZERO
-    return _converge(values, lights, view, unit, state, room, 1)
+    return _converge(samples, view, unit, state, room, 1)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -327,31 +356,40 @@ def _suffices(matt: Any, glossy: Any, values: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
 def _fit_texels(values: Any, lights: Any, views: Any, normals: Any, residuals: Any) -> None:
-    n = N_WEIGHTS
+    n, n_lights = N_WEIGHTS, values.shape[1]
+    samples = (
+        np.zeros(n_lights, np.float32),
+        np.zeros(n_lights, np.float32),
+        np.zeros((3, n_lights), np.float32),
+        np.zeros((3, n_lights), np.float32),
+    )
     room = (
-        np.zeros(n, np.float32),
-        np.zeros((n, 2), np.float32),
+        np.zeros((n + 2, n_lights), np.float32),
+        np.zeros((n, 2, n_lights), np.float32),
         np.zeros((n + 2, n + 2)),
         np.zeros(n + 2),
+        np.zeros(n_lights, np.float32),
+        np.zeros(n_lights, np.float32),
     )
     starts, weights = np.zeros((3, 3), np.float32), np.zeros((3, n), np.float32)
     for t in range(len(values)):
         unit, view = _brightest(values[t]), views[t]
         if unit <= _ZERO:
             continue
+        _take_samples(values[t], lights[t], view, samples)
         starts[:] = normals[t]
         _matt_normal(values[t], lights[t], MATT_SHARE * unit, starts[0])
         _mirror_normal(values[t], lights[t], view, HIGHLIGHT_SHARE * unit, starts[1])
-        best = _best_start(values[t], lights[t], view, unit, (starts, weights), room)
+        best = _best_start(samples, view, unit, (starts, weights), room)
         if best < 0:
             continue
         state = starts[best], weights[best]
-        residuals[t] = _converge(values[t], lights[t], view, unit, state, room, n)
+        residuals[t] = _converge(samples, view, unit, state, room, n)
         if values.shape[1] < FEW_LIGHTS:
             other = (best + 1) % len(starts)
             matt = starts[other], weights[other]
             _matt_normal(values[t], lights[t], MATT_SHARE * unit, matt[0])
-            error = _matt_fit(values[t], lights[t], view, unit, matt, room)
+            error = _matt_fit(samples, view, unit, matt, room)
             if _suffices(error, residuals[t], values[t]):
                 best, residuals[t] = other, error
         if _facing(starts[best], view) >= LEAST_COSINE:
@@ -414,4 +452,7 @@ def frames_towards(normals: Floats, directions: Floats) -> Floats:
     others = np.cross(normals, axes)
     others /= np.linalg.norm(others, axis=1, keepdims=True)
     tangents = np.where(length > 1e-4, tangents / np.maximum(length, 1e-12), others)
+    # A short difference keeps a part along the normal: a ten-thousandth loses four digits.
+    tangents -= (normals * tangents).sum(axis=1, keepdims=True) * normals
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     return np.stack([tangents, np.cross(normals, tangents), normals], axis=1).astype(np.float32)

@@ -183,6 +183,15 @@ class Light:
         falloff = self._falloff(world) / self._distances(world) ** 2
         return falloff[:, None] * self.intensity
 
+    def reaches(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether any irradiance comes from the light to world points (n, 3); (n,) bool.
+
+        Nothing is asked of shadows: False outside of a spot's cone, or of a light that is off.
+        """
+        if self.kind == SPOT:
+            return np.asarray(self.irradiance(points).any(axis=1))
+        return np.full(len(self._points(points)), self.shines)
+
     def _points(self, points: ArrayLike) -> Array:
         if self.kind in (ENVIRONMENT, GROUP):
             raise InputError(
@@ -194,7 +203,9 @@ class Light:
         return world
 
     def _distances(self, world: Array) -> Array:
-        return np.maximum(np.linalg.norm(self.position - world, axis=1), SMALLEST_DISTANCE)
+        # Column by column: of three values a row NumPy's norm takes several times as long.
+        x, y, z = (self.position[d] - world[:, d] for d in range(3))
+        return np.maximum(np.sqrt(x * x + y * y + z * z), SMALLEST_DISTANCE)
 
     def _falloff(self, world: Array) -> Array:
         """Fraction (n,) of the spot's intensity that goes towards each point."""

@@ -58,15 +58,21 @@ def _spread_view(
         if weights[j] == 0:
             continue
         at_light(plane, nodes[j], taps[j], at)
-        for c in range(3):
-            value = values[j, c]
-            if not of_samples:
-                value = np.float32(0)
-                for k in range(len(factor)):
-                    value += factor[k] * at[3 * k + c]
-            weight = weights[j] * (channels[j] >> c & 1)
+        # All channels in one loop, which the compiler can turn into vectors.
+        red, green, blue = values[j]
+        if not of_samples:
+            red = green = blue = np.float32(0)
             for k in range(len(factor)):
-                at[3 * k + c] = factor[k] * weight * value
+                red += factor[k] * at[3 * k]
+                green += factor[k] * at[3 * k + 1]
+                blue += factor[k] * at[3 * k + 2]
+        red *= weights[j] * (channels[j] & 1)
+        green *= weights[j] * (channels[j] >> 1 & 1)
+        blue *= weights[j] * (channels[j] >> 2 & 1)
+        for k in range(len(factor)):
+            at[3 * k] = factor[k] * red
+            at[3 * k + 1] = factor[k] * green
+            at[3 * k + 2] = factor[k] * blue
         _spread(spread, nodes[j], taps[j], at)
 
 

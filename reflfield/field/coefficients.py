@@ -27,6 +27,7 @@ from reflfield.observations.texel_samples import ALL_CHANNELS, Channels, Transfo
 from reflfield.util.cholesky import cholesky_factor, solve_columns, solve_vector
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 # The prior of a texel beyond its bounds grows by this, so many times at most.
@@ -36,42 +37,75 @@ ALLOWED_DEVIATION = 3.0
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _add_normal_equations(
+def _weighted_rows(
     values: Floats,
     weights: Floats,
     channels: Channels,
     plane: Floats,
     light_taps: Taps,
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
-    squares: NDArray[np.float64],
-) -> None:
-    """Add one texel's samples from one view: values (n_lights, 3), weights (n_lights,).
+    rows: Doubles,
+    rest: Doubles,
+) -> tuple[int, float]:
+    """Basis at one texel's samples from one view, and what the mean leaves, times root weights.
 
-    `channels` (n_lights,) has the bits of those that were measured.
+    Rows (3 * n_lights, K) and rest (3 * n_lights,) are filled for the channels that were
+    measured, whose number and summed weight are returned; `channels` (n_lights,) has the bits.
     """
-    n_components = len(right)
+    n_components = rows.shape[1]
     at = np.zeros(plane.shape[1], np.float32)
     nodes, taps = light_taps
+    n, total = 0, 0.0
     for j in range(len(values)):
         if weights[j] == 0:
             continue
         at_light(plane, nodes[j], taps[j], at)
+        root = np.sqrt(weights[j])
         for c in range(3):
             if not channels[j] >> c & 1:
                 continue
-            squares[1] += weights[j]
-            rest = values[j, c] - at[c]
-            squares[0] += weights[j] * rest * rest
+            rest[n] = root * (values[j, c] - at[c])
             for k in range(n_components):
-                moment = weights[j] * at[3 * (k + 1) + c]
-                right[k] += moment * rest
-                for m in range(k + 1):
-                    normal[k, m] += moment * at[3 * (m + 1) + c]
+                rows[n, k] = root * at[3 * (k + 1) + c]
+            total += weights[j]
+            n += 1
+    return n, total
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _add_normal_equations(
+    rows: Doubles,
+    rest: Doubles,
+    normal: Doubles,
+    right: Doubles,
+    squares: Doubles,
+) -> None:
+    """Add rows of a least squares problem; four at a time, so that sums are read less often.
+
+    Of `normal` the lower triangle is right; what lies above it is not.
+    """
+    n_components = len(right)
+    # Whole vectors of four.
+    ends = np.minimum((np.arange(n_components) // 4 + 1) * 4, n_components)
+    whole = len(rows) // 4 * 4
+    for i in range(0, whole, 4):
+        a, b, c, d = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
+        for k in range(n_components):
+            p, q, r, s = a[k], b[k], c[k], d[k]
+            right[k] += p * rest[i] + q * rest[i + 1] + r * rest[i + 2] + s * rest[i + 3]
+            into = normal[k]
+            for m in range(ends[k]):
+                into[m] += p * a[m] + q * b[m] + r * c[m] + s * d[m]
+    for i in range(whole, len(rows)):
+        for k in range(n_components):
+            right[k] += rows[i, k] * rest[i]
+            for m in range(ends[k]):
+                normal[k, m] += rows[i, k] * rows[i, m]
+    for i in range(len(rest)):
+        squares[0] += rest[i] * rest[i]
 
 
 @numba.njit(cache=True, nogil=True)
-def _trace(matrix: NDArray[np.float64]) -> float:
+def _trace(matrix: Doubles) -> float:
     total = 0.0
     for k in range(len(matrix)):
         total += matrix[k, k]
@@ -80,12 +114,12 @@ def _trace(matrix: NDArray[np.float64]) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _solve_texel(
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
-    precision: NDArray[np.float64],
+    normal: Doubles,
+    right: Doubles,
+    precision: Doubles,
     n_values: int,
     coefficients: Floats,
-    squares: NDArray[np.float64],
+    squares: Doubles,
 ) -> None:
     """Coefficients of one texel; its squared residual falls by what they explain.
 
@@ -117,15 +151,15 @@ def _solve_texel(
 
 @numba.njit(cache=True, nogil=True)
 def _solve_bounded(
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
-    precision: NDArray[np.float64],
+    normal: Doubles,
+    right: Doubles,
+    precision: Doubles,
     n_values: int,
     at_probes: Floats,
     top: Floats,
     deviation: float,
     coefficients: Floats,
-    squares: NDArray[np.float64],
+    squares: Doubles,
 ) -> None:
     """Coefficients of one texel, with as strong a prior as keeps it within its bounds.
 
@@ -150,31 +184,22 @@ def _solve_bounded(
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_values(weights: Floats, channels: Channels) -> int:
-    """Number of values that were measured, of samples with weight."""
-    count = 0
-    for j in range(len(weights)):
-        if weights[j] != 0:
-            for c in range(3):
-                count += channels[j] >> c & 1
-    return count
-
-
-@numba.njit(cache=True, nogil=True)
 def _solve_coefficients(
     samples: KernelSamples,
     cluster: Ints,
     table: Floats,
-    precision: NDArray[np.float64],
+    precision: Doubles,
     at_probes: Floats,
     deviation: float,
     coefficients: Floats,
-    squares: NDArray[np.float64],
+    squares: Doubles,
 ) -> None:
     n_components = precision.shape[1]
     plane = np.zeros(table.shape[2:], np.float32)
     lit = np.zeros(table.shape[2], np.int32)
     every = np.full(samples.values.shape[2], ALL_CHANNELS, np.uint8)
+    rows = np.zeros((3 * samples.values.shape[2], n_components))
+    rest = np.zeros(len(rows))
     for t in range(len(samples.values)):
         light_taps = (samples.light_nodes[t], samples.light_taps[t])
         touched = lit[: touched_nodes(light_taps[0], samples.light_weights[t], lit)]
@@ -186,20 +211,13 @@ def _solve_coefficients(
             values = samples.values[t, i]
             weights = samples.view_weights[t, i] * samples.light_weights[t] * samples.pairs[i]
             measured = samples.channels[t, i] if len(samples.channels) else every
-            n_values += _count_values(weights, measured)
             raise_top(values, weights, measured, top)
             taps = (samples.view_nodes[t, i], samples.view_taps[t, i])
             at_view(table[cluster[t]], taps, touched, plane)
-            _add_normal_equations(
-                values,
-                weights,
-                measured,
-                plane,
-                light_taps,
-                normal,
-                right,
-                squares[t],
-            )
+            n, total = _weighted_rows(values, weights, measured, plane, light_taps, rows, rest)
+            _add_normal_equations(rows[:n], rest[:n], normal, right, squares[t])
+            squares[t, 1] += total
+            n_values += n
         if squares[t, 1] > 0 and n_components > 0:
             c = cluster[t]
             _solve_bounded(
@@ -216,7 +234,7 @@ def solve_coefficients(
     *,
     bounded: bool = False,
     deviation: float = ALLOWED_DEVIATION,
-) -> tuple[Floats, NDArray[np.float64]]:
+) -> tuple[Floats, Doubles]:
     """Coefficients of texels for a fixed basis.
 
     Parameters

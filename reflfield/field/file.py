@@ -20,6 +20,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
@@ -88,7 +89,9 @@ def write_field(path: Path | str, reflectance_field: ReflectanceField) -> None:
     """
     with replacing(Path(path)) as partial, partial.open("w+b") as file:
         names = schema_of(reflectance_field)
-        members = {n: packed_array(n, reflectance_field.arrays[n]) for n in names}
+        with ThreadPoolExecutor() as pool:
+            packed = pool.map(lambda n: packed_array(n, reflectance_field.arrays[n]), names)
+            members = dict(zip(names, packed, strict=True))
         _write_archive(file, reflectance_field, members)
 
 

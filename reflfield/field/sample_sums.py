@@ -97,11 +97,10 @@ def at_view(table: Floats, taps: Taps, touched: Ints, out: Floats) -> None:
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def at_light(plane: Floats, nodes: Ints, weights: Floats, out: Floats) -> None:
     """Interpolate functions of the light (n_light_nodes, width) at one light."""
-    out[:] = 0
-    for tap in range(4):
-        weight = weights[tap]
-        for k in range(out.shape[0]):
-            out[k] += weight * plane[nodes[tap], k]
+    a, b, c, d = plane[nodes[0]], plane[nodes[1]], plane[nodes[2]], plane[nodes[3]]
+    p, q, r, s = weights[0], weights[1], weights[2], weights[3]
+    for k in range(out.shape[0]):
+        out[k] = (p * a[k] + q * b[k]) + (r * c[k] + s * d[k])
 
 
 def parts(n: int) -> Iterator[slice]:

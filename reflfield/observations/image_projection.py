@@ -117,7 +117,16 @@ def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
 def facing_irradiance(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> Floats:
     """Irradiance (n, n_lights, 3) that a surface facing each light gets; 1 if unknown."""
     points = np.asarray(positions, np.float64)
-    return np.stack([light.irradiance(points) for light in lights], axis=1).astype(np.float32)
+    irradiance = np.zeros((len(points), len(lights), 3), np.float32)
+    for j, light in enumerate(lights):
+        irradiance[:, j] = light.irradiance(points)
+    return irradiance
+
+
+def reached(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether each light sends anything (n, n_lights) to points, shadows aside."""
+    points = np.asarray(positions, np.float64)
+    return np.stack([light.reaches(points) for light in lights], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,6 +497,10 @@ def directions_of(
         Of an unknown light, world +Z: its direction does not enter.
     """
     points = np.asarray(positions, np.float64)
-    views = np.stack([camera.view_directions(points) for camera in capture.cameras], axis=1)
-    lights = np.stack([light.directions(points) for light in capture.lights], axis=1)
-    return views.astype(np.float32), lights.astype(np.float32)
+    views = np.zeros((len(points), capture.n_views, 3), np.float32)
+    lights = np.zeros((len(points), capture.n_lights, 3), np.float32)
+    for i, camera in enumerate(capture.cameras):
+        views[:, i] = camera.view_directions(points)
+    for j, light in enumerate(capture.lights):
+        lights[:, j] = light.directions(points)
+    return views, lights

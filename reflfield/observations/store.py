@@ -40,6 +40,9 @@ Location: TypeAlias = Path | str
 # resampled together.
 LEAST_TEXELS_PER_CHUNK, MOST_TEXELS_PER_CHUNK = 256, 4096
 CHUNK_BYTES = 1 << 20
+# Texels whose samples are counted together: floats of all lights of more would not stay in the
+# cache.
+TEXELS_COUNTED = 8192
 # Views of a chunk: those whose samples a writer holds together.
 VIEWS_PER_CHUNK = 8
 WRITER_BYTES = 128 << 20
@@ -137,7 +140,12 @@ class Observed:
         >>> Observed(views, np.ones((2, 3), bool), PhotographedPairs.product(2, 3)).count()
         9
         """
-        return int((self.views_under_lights() * self.lights).sum(dtype=np.float64))
+        total = 0.0
+        for first in range(0, len(self.views), TEXELS_COUNTED):
+            part = slice(first, first + TEXELS_COUNTED)
+            some = Observed(self.views[part], self.lights[part], self.pairs)
+            total += float((some.views_under_lights() * some.lights).sum(dtype=np.float64))
+        return int(total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +163,9 @@ class ObservationStore:
     location: Location
     observed: Observed
 
-    @property
+    @cached_property
     def samples(self) -> zarr.Array:
-        """(n_texels, n_photographs, 3) float16 on disk."""
+        """(n_texels, n_photographs, 3) float16 on disk; opened once."""
         return open_samples(self.location, mode="r")
 
     @cached_property

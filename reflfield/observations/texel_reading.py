@@ -14,7 +14,7 @@ from reflfield.observations.frame_resampling import (
     Nodes,
     resample,
 )
-from reflfield.observations.image_projection import directions_of, facing_irradiance
+from reflfield.observations.image_projection import directions_of, reached
 from reflfield.observations.resampling_options import (
     ResamplingOptions,
     side_for,
@@ -260,7 +260,7 @@ class TexelReader:
         """Views and lights of which some texels have samples that say something."""
         observed = self.store.observed
         # Outside a spot's cone the sample is no measurement, though no shadow falls there.
-        lit = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
+        lit = reached(self.capture.lights, self.positions[texels])
         return observed.views[texels], observed.lights[texels] & lit
 
     def count_fitted(self, texels: Indices) -> SampleCount:
@@ -326,7 +326,7 @@ class TexelReader:
         _, lights = directions_of(self.capture, self.positions[texels])
         lit = self.store.observed.lights[texels]
         # Outside a spot's cone there is no light that could come back.
-        strong = facing_irradiance(self.capture.lights, self.positions[texels]).any(axis=2)
+        strong = reached(self.capture.lights, self.positions[texels])
         shadowed = strong & ~lit
         pairs = self.store.observed.pairs
         t, photograph = np.nonzero(pairs.both(views, shadowed))

@@ -103,6 +103,10 @@ class StageRecord:
     work: dict[str, float] = field(default_factory=dict)
 
 
+# Times that resident memory is read for each time that children are looked for.
+POLLS_PER_LISTING = 10
+
+
 class MemoryWatch:
     """Largest resident memory of this process and its children while a block runs."""
 
@@ -121,17 +125,21 @@ class MemoryWatch:
         self._thread.join()
 
     def _watch(self) -> None:
-        process = psutil.Process()
+        members, polls = [psutil.Process()], 0
         while True:
-            self.peak_bytes = max(self.peak_bytes, resident_bytes(process))
+            # To find children all processes of the machine are looked through.
+            if polls % POLLS_PER_LISTING == 0:
+                members = [members[0], *members[0].children(recursive=True)]
+            polls += 1
+            self.peak_bytes = max(self.peak_bytes, resident_bytes(members))
             if self._stopped.wait(self._interval):
                 return
 
 
-def resident_bytes(process: psutil.Process) -> int:
-    """Resident memory of a process and its children."""
+def resident_bytes(processes: Iterable[psutil.Process]) -> int:
+    """Resident memory of those of some processes that still run."""
     total = 0
-    for member in [process, *process.children(recursive=True)]:
+    for member in processes:
         try:
             total += member.memory_info().rss
         except psutil.NoSuchProcess:

@@ -137,11 +137,15 @@ class BlockFiles:
         return self.folder / f"{number:06d}.block"
 
     def write(self, number: int, arrays: Arrays) -> None:
-        """Write a block's result, whole or not at all."""
+        """Write a block's result, whole or not at all.
+
+        It is not waited for until it is on the disk, which for hundreds of blocks takes
+        seconds: after a power failure it may be damaged, and is then computed again.
+        """
         text = io.BytesIO()
         np.savez(text, **dict(arrays))  # type: ignore[arg-type]
         self.folder.mkdir(parents=True, exist_ok=True)
-        with replacing(self.path(number)) as unfinished:
+        with replacing(self.path(number), flushed=False) as unfinished:
             unfinished.write_bytes(hashlib.sha256(text.getbuffer()).digest() + text.getbuffer())
 
     def read(self, number: int) -> dict[str, NDArray[Any]] | None:

@@ -273,20 +273,23 @@ def unfinished_name(path: Path) -> Path:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, flushed: bool = True) -> Iterator[Path]:
     """Yield a temporary name that becomes `path` if the block succeeds, else vanishes.
 
     The name is always the same, so that what a killed run left of it is written over. The
     content is on the disk before the name is given: after a power failure `path` holds the
-    earlier file or the new one.
+    earlier file or the new one. A file whose readers know damage by a checksum, and make it
+    again, need not be `flushed`.
     """
     partial = unfinished_name(path)
     with naming(path):
         try:
             yield partial
-            flush_to_disk(partial)
+            if flushed:
+                flush_to_disk(partial)
             partial.replace(path)
-            flush_to_disk(path.parent)
+            if flushed:
+                flush_to_disk(path.parent)
         finally:
             partial.unlink(missing_ok=True)
 

@@ -119,6 +119,17 @@ def test_frames_lean_towards_the_direction(rng):
     assert np.abs(np.einsum("nd,nd->n", frames[:, 1], view)).max() < 1e-5
 
 
+@pytest.mark.parametrize("angle", [1.1e-4, 3e-4, 1e-3])
+def test_frames_are_upright_where_normals_hardly_differ_from_the_direction(rng, angle):
+    """The difference that the x axis follows is then as small as some roundings."""
+    view = unit(rng.normal(size=(500, 3)))
+    normals = unit(view + angle * unit(np.cross(view, rng.normal(size=(500, 3)))))
+    frames = frames_towards(normals.astype(np.float32), view.astype(np.float32))
+    off = np.abs(frames @ np.swapaxes(frames, 1, 2) - np.eye(3)).max()
+    assert off < 8 * np.finfo(np.float32).eps
+    assert (np.linalg.det(frames) > 0.99).all()
+
+
 def test_shapes_are_checked():
     with pytest.raises(ShapeError, match="lights"):
         photometric_normals(

@@ -39,7 +39,8 @@ def watched(words):
     process, peak = subprocess.Popen([sys.executable, "-m", "reflfield", *words]), 0
     while process.poll() is None:
         try:
-            peak = max(peak, resident_bytes(psutil.Process(process.pid)))
+            command = psutil.Process(process.pid)
+            peak = max(peak, resident_bytes([command, *command.children(recursive=True)]))
         except psutil.NoSuchProcess:
             break
         time.sleep(0.05)

@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_rti.py                  # 800 x 800 x 64, lion, gray sphere
     python tests/benchmarks/bench_rti.py plate --side 256
-    python tests/benchmarks/bench_rti.py scale --side 1000 1414 2000    # 1, 2 and 4 megapixels
+    python tests/benchmarks/bench_rti.py scale --side 400 800 1789 3464 # .16 to 12 megapixels
 
 `plate` is the simulated `rti_plate`, `lion` is rti_loewenkopf of the test data, `gray` the matt
 sphere of uw_photometric_stereo. `reflfield run` makes a field of all but some held-out lights
@@ -14,10 +14,16 @@ pixel. All are measured on the held-out photographs by the same code. Terms are 
 byte each.
 
 Normals are those of the field, beside the least-squares ones of a matt surface. The truth of
-the plate is the simulator's; that of the sphere is its outline's.
+the plate is the simulator's; that of the sphere is its outline's. The lights of the sphere's
+set are those of its lights.txt; rows beside them have those of its chrome sphere, as
+`reflfield lights` finds them, and those that fit the sphere's true normals best, which nobody
+has: what a matt surface can reach with any lights. So do normals by regression on the truth,
+linear in the values and quadratic in their ratios: what can be reached without a model of
+light at all.
 
-`scale` prints the time, CPU time and memory of the plate at several sizes, without held-out
-lights. Writes results/rti.json, but for `scale`.
+`scale` measures time, CPU time and memory of the plate at several sizes, without held-out
+lights; photographs of more than 800 pixels a side are those of 800, each pixel many times.
+Writes results/rti.json, `scale` results/rti_scale.json.
 """
 
 from __future__ import annotations
@@ -25,21 +31,28 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.interpolate import RBFInterpolator
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent), str(ROOT)]
 
 from benchmarks.bench_captures import ran  # noqa: E402
 from benchmarks.measuring import Results  # noqa: E402
 
+from reflfield.alignment.photometric_normals import photometric_normals  # noqa: E402
+from reflfield.api.light_calibration import (  # noqa: E402
+    light_references,
+    lights_of_photographs,
+)
 from reflfield.capture.encoding import decode_srgb, encode_srgb  # noqa: E402
 from reflfield.capture.readers import open_capture  # noqa: E402
 from reflfield.field.file import open_field  # noqa: E402
@@ -50,13 +63,18 @@ from reflfield.options import HoldOut, Resources  # noqa: E402
 from reflfield.pipeline import results as stage_results  # noqa: E402
 from reflfield.pipeline import stages  # noqa: E402
 from reflfield.pipeline.comparison import relit_pairs  # noqa: E402
+from tests.large_captures import enlarged_capture  # noqa: E402
 
 DATA = Path(os.environ.get("REFLFIELD_DATA", ROOT.parent / "shared" / "data"))
 HELD_OUT = {"plate": 6, "lion": 24, "gray": 2}
 FOLDERS = {"lion": "rti_loewenkopf", "gray": "uw_photometric_stereo/gray"}
+# Share of a photograph's brightest value above which a matt surface faces the light.
+MATT_SHARE = 0.15
 # Share of the sphere's radius within which its normals count: beyond, pixels mix with the
 # backdrop and no light reaches most of it.
 SPHERE_SHARE = 0.95
+# Pixels of a side that the simulator makes; it needs 3 GB of memory for them.
+LARGEST_SIMULATED = 800
 SCENE = ROOT / "capture_sim" / "scenes" / "rti_plate.toml"
 
 
@@ -208,6 +226,68 @@ def add_row(results, name, method, n_bytes, compared):
     print(json.dumps(row), flush=True)
 
 
+def matt_normals(luminance, lights):
+    """Normals (n, 3) of a matt surface by least squares: (n, k) values, (n, k, 3) lights."""
+    gram = np.einsum("njd,nje->nde", lights, lights)
+    right = np.einsum("njd,nj->nd", lights, luminance)
+    return unit(np.linalg.solve(gram, right[..., None])[..., 0])
+
+
+def unit(vectors):
+    """Vectors (n, k) of length 1; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
+
+
+def chrome_lights(capture):
+    """Directions (n_photographs, 3) that the chrome sphere beside the gray one shows."""
+    folder = capture.root.parent / "chrome"
+    covered = cv2.imread(str(folder / "chrome.mask.png"), cv2.IMREAD_GRAYSCALE) > 127
+    rows, columns = np.nonzero(covered)
+    circle = (
+        0.5 * (columns.min() + columns.max() + 1),
+        0.5 * (rows.min() + rows.max() + 1),
+        0.25 * (np.ptp(rows) + np.ptp(columns) + 2),
+    )
+    files = [
+        folder / photograph.path.name.replace("gray", "chrome")
+        for photograph in capture.photographs
+    ]
+    references = light_references([",".join(f"{number:.2f}" for number in circle)])
+    found, _ = lights_of_photographs(files, references, encoding="linear")
+    by_name = {light.name: light.direction for light in found}
+    return np.stack([by_name[file.name] for file in files])
+
+
+def sphere_normals(context, luminance, truth):
+    """Normals of the gray sphere by other lights than its file's, by what they are."""
+    pairs = stage_results.base_reader(context).store.observed.pairs
+    photographs = [context.training.photographs[i] for i in range(len(pairs))]
+    chrome = chrome_lights(context.training)[[p.light for p in photographs]]
+    # Of a matt surface: values above the shade are those of lights in front of it.
+    bright = luminance > MATT_SHARE * luminance.max(axis=0)
+    fitted = [
+        np.linalg.lstsq(truth[lit], values[lit], rcond=None)[0]
+        for values, lit in zip(luminance.T, bright.T, strict=True)
+    ]
+    n, upright = len(luminance), np.array([0.0, 0.0, 1.0])
+    view = np.tile(upright, (n, 1))
+    several = {"lights of the chrome sphere": chrome, "lights that fit the truth": unit(fitted)}
+    shown = {}
+    for lights_of, directions in several.items():
+        lights = np.tile(directions, (n, 1, 1))
+        found, _ = photometric_normals(luminance, lights, view, view)
+        shown[f"as this field, {lights_of}"] = found
+        shown[f"matt, least squares, {lights_of}"] = matt_normals(luminance, lights)
+    values = np.column_stack([luminance, np.ones(n)])
+    ratios = unit(luminance)
+    i, j = np.triu_indices(ratios.shape[1])
+    squares = np.column_stack([np.ones(n), ratios, ratios[:, i] * ratios[:, j]])
+    for terms, columns in (("values", values), ("ratios, quadratic", squares)):
+        normals = columns @ np.linalg.lstsq(columns, truth, rcond=None)[0]
+        shown[f"regression on the truth, {terms}"] = unit(normals)
+    return shown
+
+
 def true_normals(name, context):
     """True normals (n, 3) of the texels, and which count."""
     camera, texels = context.training.cameras[0], stage_results.texels(context)
@@ -235,15 +315,15 @@ def compare_normals(results, name, context):
     chosen = np.flatnonzero(counted & measured)
     field = open_field(stage_results.field_file(context))
     samples = stage_results.base_reader(context).measured(chosen)
-    luminance = samples.samples.astype(np.float32).mean(axis=2)
+    # Values that were not measured are below the first code.
+    luminance = np.nan_to_num(samples.samples.astype(np.float32)).mean(axis=2)
     lights = samples.lights[:, samples.pairs.light]
-    gram = np.einsum("njd,nje->nde", lights, lights)
-    right = np.einsum("njd,nj->nd", lights, luminance)
-    matt = np.linalg.solve(gram, right[..., None])[..., 0]
     shown = {
         "this field": field.local_from_world[chosen, 2],
-        "matt, least squares": matt / np.linalg.norm(matt, axis=1, keepdims=True),
+        "matt, least squares": matt_normals(luminance, lights),
     }
+    if name == "gray":
+        shown |= sphere_normals(context, luminance, truth[chosen])
     for method, normals in shown.items():
         errors = angle_deg(normals, truth[chosen])
         lean = np.degrees(np.linalg.norm((normals - truth[chosen]).mean(axis=0)[:2]))
@@ -264,13 +344,27 @@ def compare_normals(results, name, context):
 def simulated(side, folder):
     """Folder of the plate at so many pixels a side."""
     folder.mkdir(parents=True, exist_ok=True)
+    if side > LARGEST_SIMULATED:
+        return enlarged(side, folder)
     text = SCENE.read_text()
     for name in ("width", "height"):
         text = text.replace(f"{name} = 256", f"{name} = {side}")
     (folder / "plate.toml").write_text(text)
     capture = folder / "capture"
     if not (capture / "capture.json").is_file():
-        ran("capture_sim", ("render", folder / "plate.toml", "-o", capture), folder / "sim.log")
+        limits = ("--workers", 1, "--max-memory", "6GB")
+        words = ("render", folder / "plate.toml", "-o", capture, *limits)
+        ran("capture_sim", words, folder / "sim.log")
+    return capture
+
+
+def enlarged(side, folder):
+    """Folder of the largest simulated plate with its pixels repeated."""
+    capture = folder / f"enlarged_{side}"
+    if not (capture / "capture.json").is_file():
+        shutil.rmtree(capture, ignore_errors=True)
+        source = simulated(LARGEST_SIMULATED, folder / "simulated")
+        enlarged_capture(source, capture, side, views=(0,), lights=range(64))
     return capture
 
 
@@ -323,7 +417,7 @@ def measure(name, options, folder, results):
 
 
 def measure_sizes(options, folder):
-    """Print what runs of several sizes take."""
+    """Rows of what runs of several sizes take."""
     results = Results("rti_scale", "RTI: time and memory by size", ["reflfield.cli"])
     results.table("sizes")
     for side in options.side:
@@ -332,6 +426,7 @@ def measure_sizes(options, folder):
         words = ("run", capture, "-o", here / "out", "--workers", options.workers)
         spent = ran("reflfield", words, here / "run.log")
         add_time(results, "plate", spent, side * side, 64)
+    print(results.write())
 
 
 def main():
