@@ -28,6 +28,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.sphere.rotations import frames_from_normals
 from reflfield.util.cholesky import cholesky_factor, solve_vector
 from reflfield.util.validation import check_shape
 
@@ -445,14 +446,8 @@ def frames_towards(normals: Floats, directions: Floats) -> Floats:
     >>> frames_towards(np.float32([[0, 0, 1]]), np.float32([[0, 0.6, 0.8]]))[0].tolist()
     [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    along = (normals * directions).sum(axis=1, keepdims=True)
-    tangents = directions - along * normals
-    length = np.linalg.norm(tangents, axis=1, keepdims=True)
-    axes = np.eye(3, dtype=np.float32)[np.argmin(np.abs(normals), axis=1)]
-    others = np.cross(normals, axes)
-    others /= np.linalg.norm(others, axis=1, keepdims=True)
-    tangents = np.where(length > 1e-4, tangents / np.maximum(length, 1e-12), others)
-    # A short difference keeps a part along the normal: a ten-thousandth loses four digits.
-    tangents -= (normals * tangents).sum(axis=1, keepdims=True) * normals
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    return np.stack([tangents, np.cross(normals, tangents), normals], axis=1).astype(np.float32)
+    # In double precision, normals of length 1 to all its digits: of a direction that is nearly
+    # the normal, little is left once its part along the normal is taken away.
+    exact = normals.astype(np.float64)
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    return frames_from_normals(exact, directions).astype(np.float32)
