@@ -15,8 +15,8 @@ from reflfield.capture.lights import DirectionalLight, Light
 from reflfield.errors import InputError
 from reflfield.options import Resources
 from reflfield.pipeline.compare_command import write_comparison_with
-from reflfield.pipeline.memory import check_frames_memory, check_image_memory
-from reflfield.pipeline.relight_command import write_relit_frames
+from reflfield.pipeline.memory import check_image_memory, check_relighting_memory
+from reflfield.pipeline.relight_command import write_relit_photographs
 from reflfield.render.environment_map import EnvironmentMap
 from reflfield.render.renderer import RenderOptions
 from reflfield.render.turntable import OrbitOptions, render_orbit
@@ -58,8 +58,8 @@ def relight(
         does not suffice.
     """
     limits = options or RenderOptions(), resources or Resources()
-    fitting = check_frames_memory(field.stored, capture, *limits)
-    return write_relit_frames(field.stored, capture, Path(out), fitting)
+    fitting = check_relighting_memory(field.stored, capture, *limits)
+    return write_relit_photographs(field.stored, capture, Path(out), fitting)
 
 
 def compare(
@@ -100,7 +100,7 @@ def compare(
         memory does not suffice.
     """
     limits = options or RenderOptions(), resources or Resources()
-    fitting = check_frames_memory(field.stored, capture, *limits, compared=True)
+    fitting = check_relighting_memory(field.stored, capture, *limits, compared=True)
     return write_comparison_with(field.stored, capture, Path(out), fitting, field_photographs)
 
 

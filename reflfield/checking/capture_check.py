@@ -46,9 +46,9 @@ from reflfield.checking.quality_findings import (
 from reflfield.checking.shading_fit import Shading, light_means, nanmean, shading_of
 from reflfield.checking.silhouette_findings import (
     Shape,
+    border_findings,
     contradiction_findings,
     edge_findings,
-    frame_findings,
 )
 from reflfield.checking.surface_samples import SurfaceSamples, sample_surface
 from reflfield.observations.intensity_agreement import other_intensities
@@ -158,7 +158,7 @@ def _of_photographs(
 def _of_views(
     capture: Capture, photographs: PhotographSet, views: Sequence[CheckedView]
 ) -> tuple[list[Finding], Shape]:
-    findings = list(frame_findings(views, capture))
+    findings = list(border_findings(views, capture))
     edges: dict[int, MaskEdge] = {}
     for view in views:
         mean = photographs.means.get(view.number)

@@ -139,7 +139,7 @@ def _pixels(view: View, points: Array) -> Array:
     imaged = np.isfinite(pixels).all(axis=1)
     if view.camera.kind != "orthographic":
         imaged &= depth > 0
-    distance = np.full(len(points), np.inf if view.outline.leaves_frame else -np.inf)
+    distance = np.full(len(points), np.inf if view.outline.leaves_image else -np.inf)
     distance[imaged] = view.outline.at(pixels[imaged])
     return distance
 

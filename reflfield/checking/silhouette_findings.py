@@ -64,12 +64,12 @@ class Shape:
     mesh: Mesh | None
 
 
-def frame_findings(views: Sequence[CheckedView], capture: Capture) -> Iterator[Finding]:
+def border_findings(views: Sequence[CheckedView], capture: Capture) -> Iterator[Finding]:
     """Findings on objects that the border of the image cuts off, or that are tiny."""
-    cut = [view for view in views if view.cone.outline.leaves_frame]
+    cut = [view for view in views if view.cone.outline.leaves_image]
     if cut:
         yield Finding(
-            "object cut by the frame",
+            "object cut by the border",
             WARNING,
             tuple(view.name for view in cut),
             f"the object touches the border of the image in {len(cut)} of {len(views)} views",

@@ -178,7 +178,7 @@ def _half_spaces(view: View, origin: Array, scale: float) -> tuple[Array, Array]
 
 
 def _refuse_unbounded(axis: int, views: Sequence[View]) -> None:
-    cut = listed([view.camera.id for view in views if view.outline.leaves_frame])
+    cut = listed([view.camera.id for view in views if view.outline.leaves_image])
     seen = f" (the object is cut off by the border of the image in {cut})" if cut else ""
     raise GeometryError(
         f"hull: expected silhouettes that bound the object on all sides, received views that "

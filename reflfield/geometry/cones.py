@@ -34,7 +34,7 @@ class View:
         perspective = self.camera.kind != "orthographic"
         imaged = np.isfinite(pixels).all(axis=1) & ((depth > 0.0) | (not perspective))
         # What a camera cannot image is empty, unless it does not see the whole object.
-        distance = np.full(len(points), np.inf if self.outline.leaves_frame else -np.inf)
+        distance = np.full(len(points), np.inf if self.outline.leaves_image else -np.inf)
         focal = 0.5 * (self.camera.fl_x + self.camera.fl_y)
         metres = (
             np.maximum(depth, 0.0) / focal if perspective else np.full_like(depth, 1 / focal)

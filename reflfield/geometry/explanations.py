@@ -290,7 +290,7 @@ def _agreement(
             views = measured_views(cameras, silhouettes, Path(folder) if folder else None)
         except ReflfieldError:
             return 0.0
-        if np.mean([view.outline.leaves_frame for view in views]) > 0.5:
+        if np.mean([view.outline.leaves_image for view in views]) > 0.5:
             return 0.0
         verdict = examine(views)
     return 0.0 if verdict is None else 1.0 - float(np.median(verdict.uncovered))

@@ -59,7 +59,7 @@ class SignedDistance:
         return replace(self, stored=path)
 
     @property
-    def leaves_frame(self) -> bool:
+    def leaves_image(self) -> bool:
         """True if the object touches the border of the image.
 
         What lies outside the frame is then unknown instead of empty.
@@ -80,7 +80,7 @@ class SignedDistance:
         inside = ndimage.map_coordinates(
             values, (nearest - 0.5).T[::-1], order=1, mode="nearest", output=np.float64
         )
-        if not self.leaves_frame:
+        if not self.leaves_image:
             return inside - beyond
         # Continuous across the border: emptiness fades to "unknown" within the frame.
         to_border = np.minimum(nearest, limit - nearest).min(axis=1)

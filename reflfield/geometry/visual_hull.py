@@ -150,7 +150,7 @@ class HullReport:
         the frame. Far below 1: calibration or silhouette of that view disagrees.
     missing : (n_views,) float64
         Share of each silhouette that the mesh does not cover.
-    leaves_frame : (n_views,) bool
+    leaves_image : (n_views,) bool
         True where the object touches the border of the image.
     contradictions : tuple of Contradiction
         Views that contradict all others.
@@ -170,7 +170,7 @@ class HullReport:
     n_triangles: int
     overlap: Array
     missing: Array
-    leaves_frame: NDArray[np.bool_]
+    leaves_image: NDArray[np.bool_]
     contradictions: tuple[Contradiction, ...] = ()
     left_out: tuple[str, ...] = ()
     specks: Mapping[str, int] = field(default_factory=dict)
@@ -242,7 +242,7 @@ def visual_hull(
         n_triangles=len(mesh.faces),
         overlap=agreement.overlap,
         missing=agreement.missing,
-        leaves_frame=np.array([view.outline.leaves_frame for view in views]),
+        leaves_image=np.array([view.outline.leaves_image for view in views]),
         contradictions=outcome.contradictions,
         left_out=outcome.left_out,
         specks=specks,
@@ -458,7 +458,7 @@ def _check_inside(volume: NDArray[np.float32], views: Sequence[View]) -> None:
     """
     ends = [volume.take(end, axis) for axis in range(3) for end in (0, -1)]
     if any((end > 0.0).any() for end in ends):
-        cut = listed([view.camera.id for view in views if view.outline.leaves_frame])
+        cut = listed([view.camera.id for view in views if view.outline.leaves_image])
         raise GeometryError(
             "hull: expected silhouettes that bound the object on all sides, received some that "
             f"the borders of their images cut off ({cut or 'none'}); leave out views that do "

@@ -132,7 +132,7 @@ class BaselineScores:
 
     def __init__(self, exposure: float) -> None:
         self.exposure = exposure
-        self._frames: dict[str, list[ImageMetrics]] = {name: [] for name in BASELINES}
+        self._images: dict[str, list[ImageMetrics]] = {name: [] for name in BASELINES}
         self._nearest: list[dict[str, Any]] = []
 
     def add_nearest(self, name: str, nearest: CarriedPhotograph) -> None:
@@ -151,7 +151,7 @@ class BaselineScores:
     def add(self, pair: ImagePair, baseline: str, image: Floats) -> None:
         """Measure a baseline of a photograph, as the field's image of it is measured."""
         measured = measure_image(replace(pair, relit=image), self.exposure)
-        self._frames[baseline].append(measured)
+        self._images[baseline].append(measured)
 
     def to_dict(self, missing: Mapping[str, str]) -> dict[str, Any]:
         """What ``metrics.json`` says: metrics of each baseline, and why one is missing."""
@@ -162,10 +162,10 @@ class BaselineScores:
         }
 
     def _described(self, name: str) -> dict[str, Any]:
-        frames = self._frames[name]
+        images = self._images[name]
         described = {
-            "mean": Comparison(tuple(frames), self.exposure).mean,
-            "frames": [frame.to_dict() for frame in frames],
+            "mean": Comparison(tuple(images), self.exposure).mean,
+            "images": [image.to_dict() for image in images],
         }
         return described | ({"nearest": self._nearest} if name == NEAREST else {})
 

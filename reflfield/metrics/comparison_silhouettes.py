@@ -53,14 +53,14 @@ class ComparisonSilhouettes:
         return stored["coverage"].astype(np.float32) / np.float32(255)
 
 
-def open_frame_silhouettes(folder: Path, frames: Capture) -> ComparisonSilhouettes:
+def open_comparison_silhouettes(folder: Path, compared: Capture) -> ComparisonSilhouettes:
     """Open what `write_comparison_silhouettes` has left of the same photographs."""
     origins = json.loads((folder / ORIGINS).read_text())
-    return ComparisonSilhouettes(folder, frames.cameras, tuple(origins))
+    return ComparisonSilhouettes(folder, compared.cameras, tuple(origins))
 
 
 def write_comparison_silhouettes(
-    frames: Capture, around: Capture, mesh: Mesh, folder: Path, threads: int = 0
+    compared: Capture, around: Capture, mesh: Mesh, folder: Path, threads: int = 0
 ) -> ComparisonSilhouettes:
     """Make and store the silhouette of every view of some photographs.
 
@@ -71,7 +71,7 @@ def write_comparison_silhouettes(
 
     Parameters
     ----------
-    frames : Capture
+    compared : Capture
         Photographs that are compared.
     around : Capture
         What they are part of, with cameras of the same names: all photographs.
@@ -89,13 +89,13 @@ def write_comparison_silhouettes(
     folder.mkdir(parents=True, exist_ok=True)
     scene, ids = RayScene(mesh, threads), [camera.id for camera in around.cameras]
     origins = []
-    for view, camera in enumerate(frames.cameras):
+    for view, camera in enumerate(compared.cameras):
         coverage, origin = _coverage(around, ids.index(camera.id), scene)
         pixels = np.rint(np.clip(coverage, 0, 1) * 255).astype(np.uint8)
         np.savez_compressed(_file(folder, view), coverage=pixels)
         origins.append(origin)
     (folder / ORIGINS).write_text(json.dumps(origins))
-    return ComparisonSilhouettes(folder, frames.cameras, tuple(origins))
+    return ComparisonSilhouettes(folder, compared.cameras, tuple(origins))
 
 
 def _file(folder: Path, view: int) -> Path:

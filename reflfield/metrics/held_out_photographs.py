@@ -25,7 +25,7 @@ class RelitPairs:
 
     Parameters
     ----------
-    frames : Capture
+    capture : Capture
         Photographs.
     folder : Path
         Holds NAME.exr of every photograph.
@@ -33,12 +33,12 @@ class RelitPairs:
         Of the views of the photographs.
     """
 
-    frames: Capture
+    capture: Capture
     folder: Path
     silhouettes: ComparisonSilhouettes
 
     def __len__(self) -> int:
-        return len(self.frames.photographs)
+        return len(self.capture.photographs)
 
     def __iter__(self) -> Iterator[ImagePair]:
         for i in range(len(self)):
@@ -46,8 +46,8 @@ class RelitPairs:
 
     def read(self, index: int) -> ImagePair:
         """Photograph `index` with the image rendered for it."""
-        photograph = self.frames.photographs[index]
-        radiance, kinds = self.frames.read_kinds(index)
+        photograph = self.capture.photographs[index]
+        radiance, kinds = self.capture.read_kinds(index)
         return ImagePair(
             name=photograph.name,
             photograph=radiance,
@@ -60,14 +60,14 @@ class RelitPairs:
 
     def measured_in(self, comparison: Comparison) -> RelitPairs:
         """Those photographs alone that a comparison of them has measured."""
-        names = {frame.name for frame in comparison.frames}
-        kept = tuple(p for p in self.frames.photographs if p.name in names)
-        return replace(self, frames=replace(self.frames, photographs=kept))
+        names = {image.name for image in comparison.images}
+        kept = tuple(p for p in self.capture.photographs if p.name in names)
+        return replace(self, capture=replace(self.capture, photographs=kept))
 
 
 def compare_with_photographs(
     field: ReflectanceField,
-    frames: Capture,
+    capture: Capture,
     silhouettes: ComparisonSilhouettes,
     folder: Path,
     options: RenderOptions | None = None,
@@ -77,7 +77,7 @@ def compare_with_photographs(
     Parameters
     ----------
     field : ReflectanceField
-    frames : Capture
+    capture : Capture
         Cameras, lights, photographs.
     silhouettes : ComparisonSilhouettes
         Of the views of the photographs.
@@ -96,13 +96,13 @@ def compare_with_photographs(
     NumericalError
         If what the field shows is not finite.
     """
-    for frame in relight_photographs(field, frames, folder, options):
-        if not np.isfinite(frame.rendering.image).all():
+    for relit in relight_photographs(field, capture, folder, options):
+        if not np.isfinite(relit.rendering.image).all():
             raise NumericalError(
-                f"photograph {frame.name!r}: expected finite radiance of the field, received "
+                f"photograph {relit.name!r}: expected finite radiance of the field, received "
                 "NaN or infinity: its values are too large; make the field again"
             )
-    return compare_images(RelitPairs(frames, folder, silhouettes))
+    return compare_images(RelitPairs(capture, folder, silhouettes))
 
 
 def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:

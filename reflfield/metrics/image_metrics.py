@@ -126,7 +126,7 @@ class Comparison:
 
     Attributes
     ----------
-    frames : tuple of ImageMetrics
+    images : tuple of ImageMetrics
     exposure : float
         The factor e that all images were multiplied with.
     warnings : tuple of str
@@ -135,7 +135,7 @@ class Comparison:
         Photographs that show no pixel of the object that could be measured.
     """
 
-    frames: tuple[ImageMetrics, ...]
+    images: tuple[ImageMetrics, ...]
     exposure: float
     warnings: tuple[str, ...] = ()
     not_measured: tuple[str, ...] = ()
@@ -144,19 +144,19 @@ class Comparison:
     def mean(self) -> dict[str, float]:
         """Plain mean over photographs of every measure."""
         keys = ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels")
-        return {k: float(np.mean([getattr(f, k) for f in self.frames])) for k in keys}
+        return {k: float(np.mean([getattr(f, k) for f in self.images])) for k in keys}
 
     @property
     def colour_ratio(self) -> tuple[float | None, ...]:
         """Mean over photographs of the ratio relit / photograph, per channel."""
-        columns = zip(*(f.colour_ratio for f in self.frames), strict=True)
+        columns = zip(*(f.colour_ratio for f in self.images), strict=True)
         kept = [[r for r in column if r is not None] for column in columns]
         return tuple(float(np.mean(column)) if column else None for column in kept)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``metrics.json``; see `to_json`."""
         return {
-            "frames": [frame.to_dict() for frame in self.frames],
+            "images": [image.to_dict() for image in self.images],
             "mean": self.mean,
             "measured": self.measured,
             "extra": {
@@ -164,8 +164,8 @@ class Comparison:
                 "pixels_per_degree": PIXELS_PER_DEGREE,
                 "psnr_cap_db": PSNR_CAP_DB,
                 "colour_ratio": list(self.colour_ratio),
-                "frames": [
-                    {"name": f.name, "colour_ratio": list(f.colour_ratio)} for f in self.frames
+                "images": [
+                    {"name": f.name, "colour_ratio": list(f.colour_ratio)} for f in self.images
                 ],
                 "definitions": dict(DEFINITIONS),
                 "warnings": list(self.warnings),
@@ -175,29 +175,29 @@ class Comparison:
     @property
     def measured(self) -> dict[str, Any]:
         """On what the measures were taken: counts over all photographs."""
-        origins = [frame.silhouette_from for frame in self.frames]
+        origins = [image.silhouette_from for image in self.images]
         return {
-            "frames": len(self.frames),
-            "pixels": sum(frame.n_pixels for frame in self.frames),
-            "saturated_pixels_left_out": sum(frame.n_excluded for frame in self.frames),
+            "images": len(self.images),
+            "pixels": sum(image.n_pixels for image in self.images),
+            "saturated_pixels_left_out": sum(image.n_excluded for image in self.images),
             "silhouettes": {origin: origins.count(origin) for origin in sorted(set(origins))},
-            "frames_not_measured": list(self.not_measured),
+            "images_not_measured": list(self.not_measured),
         }
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> Comparison:
         """The comparison that `to_dict` has told the content of."""
         extra = content["extra"]
-        ratios = {more["name"]: tuple(more["colour_ratio"]) for more in extra["frames"]}
-        frames = tuple(
-            ImageMetrics(**frame, colour_ratio=ratios[frame["name"]])
-            for frame in content["frames"]
+        ratios = {more["name"]: tuple(more["colour_ratio"]) for more in extra["images"]}
+        images = tuple(
+            ImageMetrics(**image, colour_ratio=ratios[image["name"]])
+            for image in content["images"]
         )
         return Comparison(
-            frames,
+            images,
             extra["exposure"],
             tuple(extra["warnings"]),
-            tuple(content["measured"]["frames_not_measured"]),
+            tuple(content["measured"]["images_not_measured"]),
         )
 
     def to_json(self) -> str:
@@ -207,7 +207,7 @@ class Comparison:
 
 def metrics_text(compared: Mapping[str, Any] | None, **more: Any) -> str:
     """Text of ``metrics.json``: every photograph, the mean, what was measured, and more."""
-    nothing: dict[str, Any] = {"frames": [], "mean": {}, "measured": {}}
+    nothing: dict[str, Any] = {"images": [], "mean": {}, "measured": {}}
     kept = nothing if compared is None else {name: compared[name] for name in nothing}
     return json.dumps({**kept, **more}, indent=2, allow_nan=False) + "\n"
 
@@ -238,25 +238,25 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     >>> round(common_exposure([(grey, np.ones((9, 9)))]), 6)
     4.0
     """
-    meter, n_frames = ExposureMeter(), 0
+    meter, n_pairs = ExposureMeter(), 0
     for photograph, silhouette in pictures:
-        n_frames += 1
+        n_pairs += 1
         meter.add(photograph, silhouette)
         del photograph, silhouette  # before the next ones are read
     if meter.is_empty:
         raise NothingToMeasure(
-            "frames: expected at least one object pixel to set the exposure from, received "
-            f"none in {n_frames} photographs; check the silhouettes"
+            "pairs: expected at least one object pixel to set the exposure from, received "
+            f"none in {n_pairs} photographs; check the silhouettes"
         )
     return meter.exposure
 
 
-def compare_images(frames: Iterable[ImagePair], exposure: float | None = None) -> Comparison:
+def compare_images(pairs: Iterable[ImagePair], exposure: float | None = None) -> Comparison:
     """Measure rendered images against photographs, all at one exposure.
 
     Parameters
     ----------
-    frames : iterable of ImagePair
+    pairs : iterable of ImagePair
         Read twice (exposure, then measures). A one-shot iterator is kept in
         memory; pass an object that can be iterated again, or `exposure`, to
         hold one photograph at a time.
@@ -283,10 +283,10 @@ def compare_images(frames: Iterable[ImagePair], exposure: float | None = None) -
 
     >>> white = np.ones((16, 16, 3))
     >>> result = compare_images([ImagePair("a", white, 0.9 * white, np.ones((16, 16)))])
-    >>> round(result.mean["psnr_hdr"], 9), result.frames[0].n_pixels
+    >>> round(result.mean["psnr_hdr"], 9), result.images[0].n_pixels
     (20.0, 144)
     """
-    pairs = list(frames) if isinstance(frames, Iterator) else frames
+    pairs = list(pairs) if isinstance(pairs, Iterator) else pairs
     if exposure is None:
         exposure = common_exposure(_checked(pairs))
     notes: tuple[str, ...] = ()
@@ -302,7 +302,7 @@ def compare_images(frames: Iterable[ImagePair], exposure: float | None = None) -
         del pair  # before the next one is read
     if not measured:
         raise NothingToMeasure(
-            "frames: expected at least one photograph with object pixels to compare, "
+            "pairs: expected at least one photograph with object pixels to compare, "
             "received none"
             + (f" ({', '.join(left_out)} have none); check the silhouettes" if left_out else "")
         )
@@ -456,7 +456,7 @@ def _colour_ratio(
     return red, green, blue
 
 
-def worst_to_best(frames: Sequence[ImageMetrics]) -> list[ImageMetrics]:
+def worst_to_best(images: Sequence[ImageMetrics]) -> list[ImageMetrics]:
     """Photographs by falling FLIP error, ties by name.
 
     Examples
@@ -465,4 +465,4 @@ def worst_to_best(frames: Sequence[ImageMetrics]) -> list[ImageMetrics]:
     >>> [f.name for f in worst_to_best([make("a", 0.1), make("b", 0.3)])]
     ['b', 'a']
     """
-    return sorted(frames, key=lambda f: (-f.flip, f.name))
+    return sorted(images, key=lambda f: (-f.flip, f.name))

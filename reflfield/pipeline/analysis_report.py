@@ -76,7 +76,7 @@ def analysed_images(
 
 def _shown(names: list[str], pairs: RelitPairs, folder: Path) -> Iterator[AnalysedImage]:
     """The photographs whose images were kept, one at a time."""
-    places = {p.name: i for i, p in enumerate(pairs.frames.photographs)}
+    places = {p.name: i for i, p in enumerate(pairs.capture.photographs)}
     for name in names:
         pair = pairs.read(places[name])
         files = {

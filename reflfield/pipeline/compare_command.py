@@ -27,22 +27,22 @@ from reflfield.report.sections import AnalysedImages
 from reflfield.util.files import filling
 
 # Title of the set of photographs.
-TITLE = "Frames"
+TITLE = "Photographs"
 
 
 def write_comparison_with(
     field: ReflectanceField,
-    frames: Capture,
+    capture: Capture,
     out: Path,
     options: RenderOptions,
     photographs: Capture | None = None,
 ) -> dict[str, Any]:
-    """Relight frames, measure them, and write images, ``metrics.json`` and a page.
+    """Relight photographs, measure them, and write images, ``metrics.json`` and a page.
 
     Parameters
     ----------
     field : ReflectanceField
-    frames : Capture
+    capture : Capture
         With photographs. Views without a silhouette get one made from their photographs if
         they are enough, else the field's own surface as the camera sees it.
     out : Path
@@ -50,8 +50,8 @@ def write_comparison_with(
         error.
     options : RenderOptions
     photographs : Capture, optional
-        That made the field, for the nearest one of each frame; `frames` where they are of the
-        field's own capture.
+        That made the field, for the nearest one of each photograph; `capture` where they
+        are of the field's own capture.
 
     Returns
     -------
@@ -61,21 +61,21 @@ def write_comparison_with(
     Raises
     ------
     InputError
-        If no frame can be compared, or a file of the frames would be replaced.
+        If no photograph can be compared, or a file of the capture would be replaced.
     NumericalError
         If what the field shows is not finite.
     """
     pages = [out / "metrics.json", out / "report" / "index.html"]
-    check_kept(frames, [*pages, *image_files(frames, out / "relit")])
+    check_kept(capture, [*pages, *image_files(capture, out / "relit")])
     with TemporaryDirectory() as scratch, filling(out) as partial:
         silhouettes = write_comparison_silhouettes(
-            frames, frames, Mesh(field.positions, field.faces), Path(scratch), options.workers
+            capture, capture, Mesh(field.positions, field.faces), Path(scratch), options.workers
         )
         comparison = compare_with_photographs(
-            field, frames, silhouettes, partial / "relit", options
+            field, capture, silhouettes, partial / "relit", options
         )
-        pairs = RelitPairs(frames, partial / "relit", silhouettes).measured_in(comparison)
-        analyser = _analyser(field, frames, photographs, options)
+        pairs = RelitPairs(capture, partial / "relit", silhouettes).measured_in(comparison)
+        analyser = _analyser(field, capture, photographs, options)
         analysed = analyse(analyser, pairs, comparison, Path(scratch))
         analysis = metrics_of(analysed)
         (partial / "metrics.json").write_text(metrics_text(comparison.to_dict(), **analysis))
@@ -86,30 +86,33 @@ def write_comparison_with(
 
 def _analyser(
     field: ReflectanceField,
-    frames: Capture,
+    capture: Capture,
     photographs: Capture | None,
     options: RenderOptions,
 ) -> Analyser:
     """Baselines of a field without its run: the mean texture is the field's own."""
     surface = FieldSurface(field, options.workers, options.ray_offset)
     albedo = albedo_of_field(field, surface)
-    nearest = _nearest(field, surface, frames, photographs)
+    nearest = _nearest(field, surface, capture, photographs)
     return Analyser(
         Baselines(field, surface, albedo, nearest, options), KindFinder(surface, albedo)
     )
 
 
 def _nearest(
-    field: ReflectanceField, surface: FieldSurface, frames: Capture, photographs: Capture | None
+    field: ReflectanceField,
+    surface: FieldSurface,
+    capture: Capture,
+    photographs: Capture | None,
 ) -> NearestPhotographs | str:
     """Photographs that made the field, or why there are none."""
-    if photographs is None and not is_capture_of(field, frames):
+    if photographs is None and not is_capture_of(field, capture):
         return (
             "the photographs that made the field are not at hand; name their capture with "
             "`field_photographs`"
         )
     try:
-        return NearestPhotographs(surface, photographs or frames)
+        return NearestPhotographs(surface, photographs or capture)
     except InputError as error:
         return str(error)
 
@@ -136,8 +139,8 @@ def is_capture_of(field: ReflectanceField, capture: Capture) -> bool:
 
 def _page(field: ReflectanceField, pairs: RelitPairs, images: AnalysedImages) -> ReportContent:
     return ReportContent(
-        title=f"{field.metadata.get('capture', 'field')} against {pairs.frames.name}",
-        subtitle=f"{len(pairs)} frames",
+        title=f"{field.metadata.get('capture', 'field')} against {pairs.capture.name}",
+        subtitle=f"{len(pairs)} photographs",
         key_numbers=sections.key_numbers(images.comparison),
         sections=(
             sections.held_out_section(

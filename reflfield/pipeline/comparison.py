@@ -36,8 +36,8 @@ def write_comparison(context: Context, folder: Path) -> dict[str, Any]:
     (folder / "metrics.json").write_text(
         metrics_text(main, held_out=held_out_counts(context.split))
     )
-    n_frames = sum(len(f.photographs) for f in compared_photographs(context).values())
-    return {"frames": n_frames, **counts, PROBLEMS: problems}
+    n_photographs = sum(len(f.photographs) for f in compared_photographs(context).values())
+    return {"photographs": n_photographs, **counts, PROBLEMS: problems}
 
 
 def _compare(

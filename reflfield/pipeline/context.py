@@ -115,7 +115,7 @@ class Context:
         derived = {
             "split": split,
             "training": split.training(self.capture),
-            "held_out": split.frames(self.capture),
+            "held_out": split.compared_capture(self.capture),
             "scheduler": Scheduler(self.resources.workers, self.resources.scheduler),
         }
         for name, value in derived.items():

@@ -160,7 +160,7 @@ def analyse(
     scores, errors = BaselineScores(compared.exposure), KindErrors.none()
     shown = shown_photographs(compared)
     for i in track(range(len(pairs)), len(pairs), "baselines"):
-        is_shown = pairs.frames.photographs[i].name in shown
+        is_shown = pairs.capture.photographs[i].name in shown
         errors += _analyse_one(analyser, pairs, i, scores, folder if is_shown else None)
     return {
         BASELINES: scores.to_dict(analyser.baselines.missing),
@@ -174,7 +174,7 @@ def analyse(
 
 def shown_photographs(compared: Comparison) -> list[str]:
     """Photographs whose baselines and kinds are shown: of middling error, and the worst."""
-    ranked = [frame.name for frame in worst_to_best(compared.frames)]
+    ranked = [image.name for image in worst_to_best(compared.images)]
     return list(dict.fromkeys([ranked[len(ranked) // 2], ranked[0]]))
 
 
@@ -191,10 +191,10 @@ def _analyse_one(
     folder: Path | None,
 ) -> KindErrors:
     """Score the baselines of one photograph, and return the errors of its image."""
-    photograph = pairs.frames.photographs[index]
+    photograph = pairs.capture.photographs[index]
     camera, light = (
-        pairs.frames.cameras[photograph.camera],
-        pairs.frames.lights[photograph.light],
+        pairs.capture.cameras[photograph.camera],
+        pairs.capture.lights[photograph.light],
     )
     # Before the photograph is read: others are, for this.
     nearest = analyser.baselines.nearest_to(camera, light, photograph.name)

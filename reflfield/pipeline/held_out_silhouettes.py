@@ -8,7 +8,7 @@ from typing import Any
 from reflfield.capture.capture import Capture
 from reflfield.metrics.comparison_silhouettes import (
     ComparisonSilhouettes,
-    open_frame_silhouettes,
+    open_comparison_silhouettes,
     write_comparison_silhouettes,
 )
 from reflfield.pipeline import results
@@ -21,9 +21,9 @@ STAGE = "held_out_silhouettes"
 def write_held_out_silhouettes(context: Context, folder: Path) -> dict[str, Any]:
     """Write the silhouettes of all views that are compared, once for all fields."""
     origins: list[str] = []
-    for name, frames in compared_photographs(context).items():
+    for name, compared in compared_photographs(context).items():
         made = write_comparison_silhouettes(
-            frames,
+            compared,
             with_all_photographs(context, name),
             results.hull_mesh(context),
             folder / name,
@@ -34,16 +34,16 @@ def write_held_out_silhouettes(context: Context, folder: Path) -> dict[str, Any]
 
 
 def silhouettes_digests(context: Context) -> dict[str, str]:
-    """Digests of what the silhouettes of the frames are made from."""
+    """Digests of what the silhouettes of the photographs are made from."""
     digests = {}
-    for name, frames in compared_photographs(context).items():
+    for name, compared in compared_photographs(context).items():
         whole = with_all_photographs(context, name)
-        ids = {camera.id for camera in frames.cameras}
+        ids = {camera.id for camera in compared.cameras}
         views = [i for i, camera in enumerate(whole.cameras) if camera.id in ids]
         digests[name] = context.digest_of(whole.subset(views), "cameras", "silhouettes")
     return digests
 
 
-def silhouettes_of(context: Context, name: str, frames: Capture) -> ComparisonSilhouettes:
-    """Silhouettes of a set of frames, as their stage has made them."""
-    return open_frame_silhouettes(context.stages.root / STAGE / name, frames)
+def silhouettes_of(context: Context, name: str, compared: Capture) -> ComparisonSilhouettes:
+    """Silhouettes of a set of photographs, as their stage has made them."""
+    return open_comparison_silhouettes(context.stages.root / STAGE / name, compared)

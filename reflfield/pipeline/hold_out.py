@@ -60,7 +60,7 @@ class Split:
         training = replace(capture, photographs=kept)
         return training.subset(self.training_views, self.training_lights)
 
-    def frames(self, capture: Capture) -> Capture:
+    def compared_capture(self, capture: Capture) -> Capture:
         """The compared photographs, with their views and lights alone."""
         kept = tuple(capture.photographs[i] for i in self.compared)
         views = np.unique([p.camera for p in kept]).astype(np.intp)

@@ -236,32 +236,32 @@ def check_image_memory(
     least = BASE_BYTES + field_bytes(field, directions) + map_pixels * MAP_BYTES
     least += blocks + images + texel_bytes * field.n_texels
     if least > resources.max_memory:
-        frames = f" and {kept_pixels} in all" if kept_pixels else ""
+        in_all = f" and {kept_pixels} in all" if kept_pixels else ""
         received = gigabytes(resources.max_memory)
         raise InputError(
             f"max_memory: expected at least {gigabytes(least + (1 << 26))} for images of "
-            f"{pixels} pixels{frames}, received {received}; raise it, or make the images, "
+            f"{pixels} pixels{in_all}, received {received}; raise it, or make the images, "
             "their number or the map smaller"
         )
     return fitting
 
 
-def check_frames_memory(
+def check_relighting_memory(
     field: ReflectanceField,
-    frames: Capture,
+    capture: Capture,
     options: RenderOptions,
     resources: Resources,
     *,
     compared: bool = False,
 ) -> RenderOptions:
-    """`check_image_memory` of the largest frame and map of some frames."""
-    maps = [s.file for light in frames.lights for s in light.sources if s.file is not None]
+    """`check_image_memory` of the largest photograph and map of a capture."""
+    maps = [s.file for light in capture.lights for s in light.sources if s.file is not None]
     sizes = [image_size(path) for path in maps]
     return check_image_memory(
         field,
         resources,
         options,
-        pixels=max((c.width * c.height for c in frames.cameras), default=0),
+        pixels=max((c.width * c.height for c in capture.cameras), default=0),
         pixel_bytes=IMAGE_BYTES + compared * COMPARED_BYTES,
         texel_bytes=compared * BASELINE_TEXEL_BYTES,
         map_pixels=max((width * height for width, height in sizes), default=0),

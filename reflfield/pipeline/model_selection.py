@@ -282,7 +282,7 @@ def _heldout_psnr(folder: Path) -> list[float]:
     if not (folder / "heldout.json").is_file():  # no photograph shows a pixel of the object
         return []
     metrics = json.loads((folder / "heldout.json").read_text())
-    return [frame["psnr_ldr"] for frame in metrics["frames"]]
+    return [image["psnr_ldr"] for image in metrics["images"]]
 
 
 def clearly_best(psnr: Mapping[str, Sequence[float]]) -> str:

@@ -40,7 +40,7 @@ from reflfield.report import sections
 from reflfield.report.page import ReportContent, Section, write_report
 
 # Sets of photographs that are compared: title and sentence.
-FRAME_TITLES = {
+PHOTOGRAPH_TITLES = {
     "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
     "truth": ("Unseen views and lights", "Simulated from cameras and lights off the rig."),
 }
@@ -74,7 +74,7 @@ def report_content(
     }
     main = compared.get("heldout") or compared.get("truth")
     parts = [
-        *_frames_sections(context, compared),
+        *_photograph_sections(context, compared),
         *_analysis_sections(context, compared),
         *_selection_sections(context),
         *_ablation_sections(context, compared),
@@ -195,13 +195,13 @@ def _silhouette_views(context: Context) -> Iterator[sections.SilhouetteView]:
         )
 
 
-def _frames_sections(
+def _photograph_sections(
     context: Context, compared: dict[str, Comparison | None]
 ) -> Iterator[Section]:
     for name, pairs in comparison.relit_pairs(context).items():
         measured = compared[name]
         if measured is not None:
-            title, intro = FRAME_TITLES[name]
+            title, intro = PHOTOGRAPH_TITLES[name]
             yield sections.held_out_section(measured, pairs, title=title, intro=intro)
 
 
@@ -213,7 +213,7 @@ def _analysis_sections(
     for name, pairs in comparison.relit_pairs(context).items():
         measured, analysed = compared[name], error_analysis.analysis_of(context, name)
         if measured is not None and analysed is not None:
-            title = FRAME_TITLES[name][0]
+            title = PHOTOGRAPH_TITLES[name][0]
             sets.append(analysed_images(title, measured, analysed, pairs, folder / name))
     return sections.analysis_sections(sets) if sets else ()
 
@@ -282,7 +282,7 @@ def _variant(
     """A field as the sections take it that compare several."""
     return sections.FieldVariant(
         name,
-        {FRAME_TITLES[n][0]: c for n, c in compared.items() if c is not None},
+        {PHOTOGRAPH_TITLES[n][0]: c for n, c in compared.items() if c is not None},
         counts["field bytes"],
         counts["relative error of the samples"],
         counts["relative error of their cube roots"],

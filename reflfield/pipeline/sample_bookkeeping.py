@@ -155,7 +155,7 @@ def _frames(context: Context) -> CountedItems:
         if measured is None:
             parts[f"{names[name]}, not compared"] = len(frames.photographs)
             continue
-        parts[f"{names[name]}, measured"] = len(measured.frames)
+        parts[f"{names[name]}, measured"] = len(measured.images)
         if measured.not_measured:
             parts[f"{names[name]}, without an object pixel"] = len(measured.not_measured)
     total = sum(len(frames.photographs) for frames in sets.values())

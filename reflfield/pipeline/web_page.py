@@ -45,7 +45,7 @@ def write_web_page(context: Context, folder: Path) -> dict[str, Any]:
     bookmarks = [
         bookmark
         for name, pairs in comparison.relit_pairs(context).items()
-        for bookmark in _bookmarks(name, pairs.frames, comparison.comparison_of(context, name))
+        for bookmark in _bookmarks(name, pairs.capture, comparison.comparison_of(context, name))
     ]
     try:
         moved = distances_to_hull(context)
@@ -73,25 +73,27 @@ def page_digests(context: Context) -> dict[str, str]:
     }
 
 
-def _bookmarks(name: str, frames: Capture, measured: Comparison | None) -> Iterator[Bookmark]:
+def _bookmarks(name: str, compared: Capture, measured: Comparison | None) -> Iterator[Bookmark]:
     """Some photographs of a set, at the exposure that it was compared at."""
     if measured is None:
         return
     shown = [
         i
-        for i, photograph in enumerate(frames.photographs)
-        if can_be_shown(frames.cameras[photograph.camera], frames.lights[photograph.light])
+        for i, photograph in enumerate(compared.photographs)
+        if can_be_shown(compared.cameras[photograph.camera], compared.lights[photograph.light])
     ]
     n_chosen = min(MOST_PHOTOGRAPHS, len(shown))
     for i in np.unique(np.linspace(0, len(shown) - 1, n_chosen).astype(int)) if shown else ():
-        photograph = frames.photographs[shown[i]]
+        photograph = compared.photographs[shown[i]]
         yield Bookmark(
             name=photograph.name,
             note=NOTES[name],
-            camera=frames.cameras[photograph.camera],
-            lights=frames.lights[photograph.light].sources,
+            camera=compared.cameras[photograph.camera],
+            lights=compared.lights[photograph.light].sources,
             exposure=measured.exposure,
-            picture=_jpeg(encoded_picture(frames.read_photograph(shown[i]), measured.exposure)),
+            picture=_jpeg(
+                encoded_picture(compared.read_photograph(shown[i]), measured.exposure)
+            ),
         )
 
 

@@ -41,7 +41,7 @@ class RelitImage:
 
 def relight_photographs(
     field: ReflectanceField,
-    frames: Capture,
+    capture: Capture,
     out_dir: Path | str,
     options: RenderOptions | None = None,
     *,
@@ -53,7 +53,7 @@ def relight_photographs(
     ----------
     field : ReflectanceField
         What to show.
-    frames : Capture
+    capture : Capture
         Cameras, lights and names, as `open_capture(path,
         require_photographs=False)` reads them; the photographs are not read.
     out_dir : Path or str
@@ -62,7 +62,7 @@ def relight_photographs(
         Samples, threads.
     exposure : float, optional
         Factor before the sRGB encoding of the PNGs. By default one for all
-        frames: 1 / the 99.5th percentile of the luminance of the object's pixels over
+        images: 1 / the 99.5th percentile of the luminance of the object's pixels over
         all photographs, so images can be compared by eye.
 
     Yields
@@ -76,25 +76,25 @@ def relight_photographs(
     InputError
         If two photographs have one name, or a light is unknown.
     """
-    _check_names(frames)
+    _check_names(capture)
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     renderer = Renderer(field, options)
     relit, meter = [], ExposureMeter()
-    total = len(frames.photographs)
-    for photograph in track(frames.photographs, total, "relighting"):
-        camera, light = frames.cameras[photograph.camera], frames.lights[photograph.light]
+    total = len(capture.photographs)
+    for photograph in track(capture.photographs, total, "relighting"):
+        camera, light = capture.cameras[photograph.camera], capture.lights[photograph.light]
         rendering = renderer.render(camera, light)
-        frame = RelitImage(
+        image = RelitImage(
             photograph.name,
             rendering,
             folder / f"{photograph.name}.exr",
             folder / f"{photograph.name}.png",
         )
-        write_exr(frame.exr, _with_coverage(rendering), names=["R", "G", "B", "A"])
+        write_exr(image.exr, _with_coverage(rendering), names=["R", "G", "B", "A"])
         meter.add(rendering.image, rendering.coverage)
-        relit.append((frame.exr, frame.png))
-        yield frame
+        relit.append((image.exr, image.png))
+        yield image
     factor = meter.exposure_or_one if exposure is None else exposure
     for exr, png in relit:
         write_png(png, encoded_picture(read_image(exr), factor))
@@ -104,15 +104,15 @@ def _with_coverage(rendering: Rendering) -> np.ndarray:
     return np.concatenate([rendering.image, rendering.coverage[..., None]], axis=2)
 
 
-def _check_names(frames: Capture) -> None:
+def _check_names(capture: Capture) -> None:
     seen: set[str] = set()
-    for photograph in frames.photographs:
+    for photograph in capture.photographs:
         name = photograph.name
         if name in seen:
             raise InputError(
-                f"frames: expected one photograph of each name, received {name!r} twice; "
+                f"capture: expected one photograph of each name, received {name!r} twice; "
                 "the second would overwrite the first"
             )
         if Path(name).name != name:
-            raise InputError(f"frames: expected names without folders, received {name!r}")
+            raise InputError(f"capture: expected names without folders, received {name!r}")
         seen.add(name)

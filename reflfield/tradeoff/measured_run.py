@@ -170,7 +170,7 @@ def _images(context: Context, name: str) -> dict[str, Any]:
     compared = comparison_of(context, name)
     if compared is None:
         return {}
-    return {"mean": compared.mean, "psnr": [frame.psnr_ldr for frame in compared.frames]}
+    return {"mean": compared.mean, "psnr": [image.psnr_ldr for image in compared.images]}
 
 
 def _truth(context: Context) -> dict[str, float]:
@@ -192,7 +192,7 @@ def reported_outcome(job: Job, reported: Capture) -> dict[str, Any]:
         compared = compare_with_photographs(
             field, reported, silhouettes, folder / "relit", options
         )
-    return {"mean": compared.mean, "psnr": [frame.psnr_ldr for frame in compared.frames]}
+    return {"mean": compared.mean, "psnr": [image.psnr_ldr for image in compared.images]}
 
 
 def main() -> None:

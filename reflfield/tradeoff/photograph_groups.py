@@ -154,7 +154,7 @@ def photograph_groups(capture: Capture, hold_out: HoldOut | None = None) -> Phot
     kept = [*inner.trained.tolist(), *inner.compared.tolist()]
     photographs = tuple(_as_test(rest.photographs[i], i in chosen) for i in sorted(kept))
     trained = replace(rest, photographs=photographs)
-    return PhotographGroups(trained, outer.frames(capture), capture)
+    return PhotographGroups(trained, outer.compared_capture(capture), capture)
 
 
 def _as_test(photograph: Photograph, is_test: bool) -> Photograph:

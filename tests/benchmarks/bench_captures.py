@@ -190,7 +190,7 @@ def image_row(results, what, field, metrics):
         {
             "images": what,
             "field": field,
-            "number": len(metrics["frames"]),
+            "number": len(metrics["images"]),
             "PSNR, dB": round(mean["psnr_ldr"], 3),
             "HDR PSNR, dB": round(mean["psnr_hdr"], 3),
             "SSIM": round(mean["ssim"], 4),

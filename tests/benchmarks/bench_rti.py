@@ -200,7 +200,7 @@ def compare_methods(results, name, context, field_bytes):
     each = field_bytes / n_pixels
     add_row(results, name, "this field", each, ours)
     white = white_of(context.training)
-    made, asked = Photographs(context.training, white), Photographs(pairs.frames, white)
+    made, asked = Photographs(context.training, white), Photographs(pairs.capture, white)
     values = made.encoded()
     for method, (predict, n_bytes) in methods(each).items():
         shown = predict(made.directions, values, asked.directions)

@@ -208,7 +208,7 @@ def test_noisy_outlines_and_views_cut_by_the_frame_are_not_doubted(rig, rng):
     noisy += [rigs.lobed_silhouette(camera) for camera in close]
     close = [replace(camera, id=f"close{i}") for i, camera in enumerate(close)]
     _, report = visual_hull([*views, *close], noisy, COARSE)
-    assert report.leaves_frame[-2:].all()
+    assert report.leaves_image[-2:].all()
     assert report.warnings == ()
 
 
@@ -224,7 +224,7 @@ def test_specks_at_the_border_are_named_and_removed(rig):
     mesh, report = visual_hull(views, dirty, COARSE)
     assert report.specks == {"v000": 2, "v001": 2, "v002": 2}
     assert "6 small parts of silhouettes that no other view supports" in report.warnings[0]
-    assert not report.leaves_frame.any()
+    assert not report.leaves_image.any()
     assert mesh.vertices.tobytes() == clean.vertices.tobytes()
 
 

@@ -80,7 +80,7 @@ def test_views_that_crop_the_object_carve_only_what_they_see():
     silhouettes = [rigs.ball_silhouette(view) for view in views]
     silhouettes[-1][:, :40] = 0.0  # what it does see on its left is empty
     mesh, report = visual_hull(views, silhouettes, RAW)
-    assert list(np.flatnonzero(report.leaves_frame)) == [12]
+    assert list(np.flatnonzero(report.leaves_image)) == [12]
     uncut, _ = ball_hull()
     # The cropped view removes what it sees, not what lies outside its frame.
     assert 0.2 * uncut.volume < mesh.volume < 0.95 * uncut.volume

@@ -60,11 +60,11 @@ def test_outside_the_frame_is_empty_unless_the_object_leaves_it():
     silhouette = np.zeros((20, 20))
     silhouette[5:15, 5:15] = 1.0
     whole = signed_distance(silhouette)
-    assert not whole.leaves_frame
+    assert not whole.leaves_image
     assert whole.at(np.array([[-5.0, 10.0]]))[0] < -9.0
     silhouette[5:15, :15] = 1.0
     cropped = signed_distance(silhouette)
-    assert cropped.leaves_frame
+    assert cropped.leaves_image
     assert cropped.at(np.array([[-5.0, 10.0], [30.0, 10.0]])).min() > 0.0
     assert cropped.at(np.array([[17.5, 2.5]]))[0] < 0.0
 

@@ -67,7 +67,7 @@ def test_a_baseline_is_measured_as_the_field_is(matt):
     scores.add(pair, BLACK, black)
     document = scores.to_dict({NEAREST: "no photographs", MEAN: "none"})
     expected = measure_image(ImagePair("a", truth.image, black, truth.coverage), 2.0)
-    assert document[BLACK]["frames"] == [expected.to_dict()]
+    assert document[BLACK]["images"] == [expected.to_dict()]
     assert document[BLACK]["mean"]["psnr_ldr"] == expected.psnr_ldr
     assert document["missing"] == {NEAREST: "no photographs", MEAN: "none"}
     assert NEAREST not in document

@@ -53,11 +53,11 @@ def test_constant_error_gives_the_psnr_worked_out_by_hand():
     photograph = np.full((20, 20, 3), 0.5)
     result = compare_images([ImagePair("a", photograph, photograph - 0.05, np.ones((20, 20)))])
     assert result.exposure == pytest.approx(2.0, rel=1e-12)
-    assert result.frames[0].psnr_hdr == pytest.approx(20.0, abs=1e-9)
+    assert result.images[0].psnr_hdr == pytest.approx(20.0, abs=1e-9)
     # LDR: sRGB(1) = 1 against sRGB(0.9) = 1.055 * 0.9^(1/2.4) - 0.055.
     error = 1 - (1.055 * 0.9 ** (1 / 2.4) - 0.055)
-    assert result.frames[0].psnr_ldr == pytest.approx(-20 * math.log10(error), abs=1e-9)
-    assert result.frames[0].n_pixels == 16 * 16
+    assert result.images[0].psnr_ldr == pytest.approx(-20 * math.log10(error), abs=1e-9)
+    assert result.images[0].n_pixels == 16 * 16
 
 
 def test_overexposure_counts_in_hdr_only():
@@ -89,7 +89,7 @@ def test_erosion_keeps_what_is_farther_than_two_pixels_from_the_outside(rng):
 @pytest.mark.reference
 def test_ssim_and_flip_are_those_of_their_packages(frames):
     result = compare_images(frames)
-    for pair, got in zip(frames, result.frames, strict=True):
+    for pair, got in zip(frames, result.images, strict=True):
         counted = object_pixels(pair.silhouette)
         covered = (pair.silhouette >= 0.5)[..., None]
         shown = [
@@ -119,19 +119,19 @@ def test_equal_pictures_are_perfect_and_the_file_stays_valid(frames):
 def test_file_holds_exactly_what_is_promised(frames):
     content = json.loads(compare_images(frames).to_json())
     keys = {"name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
-    assert set(content) == {"frames", "mean", "measured", "extra"}
+    assert set(content) == {"images", "mean", "measured", "extra"}
     assert all(
-        set(frame) == keys | {"n_excluded", "silhouette_from"} for frame in content["frames"]
+        set(image) == keys | {"n_excluded", "silhouette_from"} for image in content["images"]
     )
     assert content["measured"] == {
-        "frames": 3,
+        "images": 3,
         "pixels": sum(int(object_pixels(pair.silhouette).sum()) for pair in frames),
         "saturated_pixels_left_out": 0,
         "silhouettes": {"given": 3},
-        "frames_not_measured": [],
+        "images_not_measured": [],
     }
     for key in keys - {"name"}:
-        values = [frame[key] for frame in content["frames"]]
+        values = [image[key] for image in content["images"]]
         assert content["mean"][key] == pytest.approx(np.mean(values), rel=1e-12)
     # Planted: 5 % too red, 5 % too little green; the noise averages out to < 1 %.
     assert content["extra"]["colour_ratio"] == pytest.approx([1.05, 0.95, 1.0], abs=0.01)
@@ -151,7 +151,7 @@ def test_a_common_scale_changes_nothing(exponent):
         "a", *(x * 2.0**exponent for x in (photograph, pair.relit)), disk(24, 10)
     )
     a, b = compare_images([pair]), compare_images([scaled])
-    assert a.frames == b.frames
+    assert a.images == b.images
     assert a.exposure == b.exposure * 2.0**exponent
 
 
@@ -196,7 +196,7 @@ def test_black_photographs_are_measured_with_a_warning():
     result = compare_images([ImagePair("a", black, black + 0.1, np.ones((16, 16)))])
     assert result.exposure == 1
     assert "black" in result.warnings[0]
-    assert result.frames[0].psnr_hdr == pytest.approx(20, abs=1e-9)
+    assert result.images[0].psnr_hdr == pytest.approx(20, abs=1e-9)
     content = json.loads(result.to_json())
     assert content["extra"]["colour_ratio"] == [None, None, None]
 
@@ -225,8 +225,8 @@ def test_one_firefly_does_not_set_the_exposure():
 def test_smallest_pictures_that_have_object_pixels(size, rng):
     photograph = rng.uniform(size=(size, size, 3))
     result = compare_images([ImagePair("a", photograph, photograph, np.ones((size, size)))])
-    assert result.frames[0].n_pixels == (size - 4) ** 2
-    assert result.frames[0].ssim == pytest.approx(1, abs=1e-12)
+    assert result.images[0].n_pixels == (size - 4) ** 2
+    assert result.images[0].ssim == pytest.approx(1, abs=1e-12)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -243,8 +243,8 @@ def test_a_frame_without_object_is_left_out_by_name(frames):
     empty = ImagePair("left_out", frames[0].photograph, frames[0].relit, np.zeros((40, 40)))
     result = compare_images([frames[0], empty])
     assert result.not_measured == ("left_out",)
-    assert result.frames == compare_images([frames[0]]).frames
-    assert json.loads(result.to_json())["measured"]["frames_not_measured"] == ["left_out"]
+    assert result.images == compare_images([frames[0]]).images
+    assert json.loads(result.to_json())["measured"]["images_not_measured"] == ["left_out"]
     with pytest.raises(NothingToMeasure, match="object pixel"):
         compare_images([empty])
     with pytest.raises(NothingToMeasure, match="left_out have none"):
@@ -261,9 +261,9 @@ def test_saturated_pixels_are_not_counted_and_change_nothing_else(frames):
     for bright in (1.0, 50.0):
         relit = np.where(saturated[..., None], bright * b.photograph, b.relit)
         pair = replace(b, relit=relit, excluded=saturated)
-        results.append(compare_images([a, pair], exposure=0.5).frames[1])
+        results.append(compare_images([a, pair], exposure=0.5).images[1])
     assert results[0] == results[1]
-    plain = compare_images([a, b], exposure=0.5).frames[1]
+    plain = compare_images([a, b], exposure=0.5).images[1]
     counted = object_pixels(b.silhouette) & ~saturated
     n = int((object_pixels(b.silhouette) & saturated).sum())
     assert n == 9

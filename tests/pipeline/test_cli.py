@@ -170,7 +170,7 @@ def test_compare_prints_and_writes_metrics(reflfield, finished, tiny_capture, tm
     field = finished.folder / "field.rfld"
     outcome = reflfield("compare", field, frames, "-o", out, "--rays-per-pixel", "1")
     assert outcome.status == 0
-    assert "2 frames: PSNR" in outcome.out
+    assert "2 images: PSNR" in outcome.out
     assert (out / "metrics.json").is_file()
     assert (out / "report" / "index.html").is_file()
 
@@ -268,8 +268,8 @@ def test_compare_without_silhouettes_measures_the_whole_object(
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     truth = read_coverage(capture_copy / "silhouettes" / "v005.png")
     # The hull's outline is within a pixel of the object's: 60 pixels of the 360 lie on it.
-    assert [f["silhouette_from"] for f in metrics["frames"]] == ["hull", "hull"]
-    for frame in metrics["frames"]:
+    assert [f["silhouette_from"] for f in metrics["images"]] == ["hull", "hull"]
+    for frame in metrics["images"]:
         assert frame["n_pixels"] == pytest.approx(object_pixels(truth).sum(), abs=30)
 
 
@@ -296,7 +296,7 @@ def test_demo(subprocess_run, tmp_path):
     assert [s for s in outcome.err.splitlines() if not s.endswith(" left")] == []
     assert (out / "capture" / "capture.json").is_file()
     metrics = json.loads((out / "metrics.json").read_text())
-    assert len(metrics["frames"]) == 4
+    assert len(metrics["images"]) == 4
     # 30.7 was measured (tests/benchmarks/results/capture_demo.json), 28.9 with one lobe of
     # three, 26.8 with the clustered model.
     assert metrics["mean"]["psnr_ldr"] > 29.5

@@ -76,7 +76,7 @@ def test_a_camera_without_photographs_is_said_and_worked_around(
         "12 others of those are used for neither; 32 of 45 make the field"
     ) in outcome.out
     assert open_field(out / "field.rfld").metadata["views"] == 9
-    assert len(json.loads((out / "metrics.json").read_text())["frames"]) == 1
+    assert len(json.loads((out / "metrics.json").read_text())["images"]) == 1
     page = (out / "report" / "index.html").read_text()
     assert "of which only the silhouette is used" in page
     # All nine cameras' silhouettes are set against the hull, the one without pictures too.

@@ -25,10 +25,10 @@ def metrics(finished):
 
 def test_black_gets_what_a_black_image_gets(metrics, finished, tiny_capture):
     capture = open_capture(tiny_capture)
-    frames = split_of(capture, HoldOut(1, 1)).frames(capture)
+    frames = split_of(capture, HoldOut(1, 1)).compared_capture(capture)
     stored = json.loads((finished.folder / "stages/comparison/field/heldout.json").read_text())
     exposure = stored["extra"]["exposure"]
-    (frame,) = metrics["baselines"]["black"]["frames"]
+    (frame,) = metrics["baselines"]["black"]["images"]
     counted = object_pixels(frames.read_silhouette(0))
     shown = display(frames.read_photograph(0)[counted], exposure)
     assert frame["name"] == frames.photographs[0].name
@@ -40,9 +40,9 @@ def test_the_baselines_are_those_of_the_compared_photographs(metrics):
     baselines = metrics["baselines"]
     assert baselines["missing"] == {}
     for name in NAMES:
-        frames = baselines[name]["frames"]
-        assert [f["name"] for f in frames] == [f["name"] for f in metrics["frames"]]
-        assert [f["n_pixels"] for f in frames] == [f["n_pixels"] for f in metrics["frames"]]
+        frames = baselines[name]["images"]
+        assert [f["name"] for f in frames] == [f["name"] for f in metrics["images"]]
+        assert [f["n_pixels"] for f in frames] == [f["n_pixels"] for f in metrics["images"]]
     # A satin ball of one colour: a field, however coarse, is better than nothing.
     assert metrics["mean"]["psnr_ldr"] > baselines["black"]["mean"]["psnr_ldr"] + 6
 
@@ -98,7 +98,7 @@ def test_compare_says_that_there_are_no_photographs_of_the_field(
     outcome = reflfield(*words, "-o", tmp_path / "with", "--photographs", tiny_capture)
     assert outcome.status == 0, outcome.err
     beside = json.loads((tmp_path / "with" / "metrics.json").read_text())
-    assert len(beside["baselines"]["nearest_photograph"]["frames"]) == 2
+    assert len(beside["baselines"]["nearest_photograph"]["images"]) == 2
     assert beside["baselines"]["black"] == without["baselines"]["black"]
 
 
@@ -118,7 +118,7 @@ def test_one_image_of_a_baseline_is_held_at_a_time():
     baselines = SimpleNamespace(nearest_to=lambda *_: None, images=images)
     photograph = SimpleNamespace(camera=0, light=0, name="a")
     frames = SimpleNamespace(photographs=[photograph], cameras=[None], lights=[None])
-    pairs = SimpleNamespace(frames=frames, read=lambda _: None)
+    pairs = SimpleNamespace(capture=frames, read=lambda _: None)
     scores = SimpleNamespace(add=lambda *_: None)
     analyser = error_analysis.Analyser(baselines, None)
     error_analysis._analyse_one(analyser, pairs, 0, scores, None)

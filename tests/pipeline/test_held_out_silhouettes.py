@@ -51,7 +51,7 @@ def rim(silhouette):
 
 
 def frames_of(capture, hold_out):
-    return split_of(capture, hold_out).frames(capture)
+    return split_of(capture, hold_out).compared_capture(capture)
 
 
 def made(capture, frames, hull, folder):
@@ -142,7 +142,7 @@ def test_a_dark_held_out_frame_does_not_end_the_run(
     outcome = run_tiny(out, *BARE, *words, capture=capture_copy)
     assert outcome.status == 0, outcome.err
     metrics = json.loads((out / "metrics.json").read_text())
-    lit, dark = metrics["frames"]
+    lit, dark = metrics["images"]
     assert (lit["name"], dark["name"]) == ("v005_l001", "v005_l004")
     # As of a view that is not held out: from all its photographs.
     expected = object_pixels(open_capture(capture_copy).read_silhouette(5)).sum()

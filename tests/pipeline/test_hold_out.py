@@ -84,7 +84,7 @@ class TestDense:
         assert (len(split.trained), len(split.aside)) == (164, 0)
         assert split.training(capture).n_views == 14
         assert split.training(capture).n_lights == 12
-        assert [p.name for p in split.frames(capture).photographs] == [
+        assert [p.name for p in split.compared_capture(capture).photographs] == [
             f"v{i}_l{j}" for i, j in compared
         ]
 

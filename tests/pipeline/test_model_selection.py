@@ -289,9 +289,9 @@ def test_photographs_held_out_one_by_one_decide_too(run_auto, tmp_path, tiny_cap
     psnr = {}
     for name in ("samples", "grid"):
         compared = tmp_path / "stages" / "model_selection" / name / "heldout.json"
-        frames = json.loads(compared.read_text())["frames"]
-        assert [f["name"] for f in frames] == [p.name for p in context.held_out.photographs]
-        psnr[name] = [frame["psnr_ldr"] for frame in frames]
+        images = json.loads(compared.read_text())["images"]
+        assert [f["name"] for f in images] == [p.name for p in context.held_out.photographs]
+        psnr[name] = [image["psnr_ldr"] for image in images]
         assert len(psnr[name]) == 3
     # None of the three has made any of the fields: 57 of 60 have.
     used = {p.path for p in context.training.photographs}

@@ -117,7 +117,7 @@ class TestWhatARunLeaves:
         metrics = json.loads((finished.folder / "metrics.json").read_text())
         measured = {"psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
         assert set(metrics) == {
-            "frames",
+            "images",
             "mean",
             "measured",
             "held_out",
@@ -125,7 +125,7 @@ class TestWhatARunLeaves:
             "error_kinds",
         }
         told = {"name", "n_excluded", "silhouette_from"}
-        assert [set(frame) for frame in metrics["frames"]] == [told | measured]
+        assert [set(image) for image in metrics["images"]] == [told | measured]
         assert metrics["measured"]["silhouettes"] == {"given": 1}
         assert metrics["measured"]["pixels"] == metrics["mean"]["n_pixels"] > 200
         assert metrics["held_out"] == {
@@ -135,7 +135,7 @@ class TestWhatARunLeaves:
             "photographs_of_the_field": 45,
         }
         assert set(metrics["mean"]) == measured
-        assert metrics["frames"][0]["name"].startswith("v")
+        assert metrics["images"][0]["name"].startswith("v")
 
     def test_timings_name_every_stage_with_memory_and_size(self, finished):
         timings = json.loads((finished.folder / "timings.json").read_text())

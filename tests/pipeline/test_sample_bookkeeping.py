@@ -78,6 +78,6 @@ def test_a_stage_that_loses_one_is_found_out(finished_context, stage, count):
 def test_a_frame_that_was_not_measured_is_found_out(finished_context):
     path = finished_context.stages.root / "comparison" / "field" / "truth.json"
     metrics = json.loads(path.read_text())
-    metrics["frames"].pop()
+    metrics["images"].pop()
     path.write_text(json.dumps(metrics))
     assert sum(one.missing for one in sample_counts(finished_context)) == 1

@@ -18,7 +18,7 @@ def images(rng):
     pair = ImagePair("f0", photograph, 0.9 * photograph, np.ones((24, 24)))
     comparison = compare_images([pair])
     mean = comparison.mean | {"psnr_ldr": 12.345}
-    scores = {"mean": mean, "frames": [{"name": "f0", "psnr_ldr": 12.345}]}
+    scores = {"mean": mean, "images": [{"name": "f0", "psnr_ldr": 12.345}]}
     kinds = {
         name: {"share_of_pixels": 0.25, "share_of_squared_error": 0.5, "psnr_ldr": None}
         for name in KINDS

@@ -38,7 +38,7 @@ def test_frames_of_one_name_stay_apart_and_others_are_refused(rng, samples):
         i for i in sections.held_out_section(comparison, same).items if isinstance(i, Figure)
     ]
     # Worst first: the second frame has twice the noise.
-    for figure, metrics in zip(figures, comparison.frames[::-1], strict=False):
+    for figure, metrics in zip(figures, comparison.images[::-1], strict=False):
         assert figure.title == "0001"
         assert f"PSNR {metrics.psnr_ldr:.2f} dB" in figure.caption
     with pytest.raises(InputError, match=r"pairs: expected '0001'.*'heldout_000'"):

@@ -147,7 +147,7 @@ def median_photograph(
         What to look at.
     """
     compared = [next(iter(variant.comparisons.values())) for variant in variants]
-    flips = np.array([[frame.flip for frame in c.frames] for c in compared])
+    flips = np.array([[image.flip for image in c.images] for c in compared])
     gains = flips[1] - flips[0]
     chosen = int(np.argsort(gains, kind="stable")[len(gains) // 2])
     rows = [
@@ -176,4 +176,4 @@ def median_photograph(
 
 def _row_of(chosen: int, own_pairs: Iterable[ImagePair], comparison: Comparison) -> ComparedRow:
     pair = next(pair for i, pair in enumerate(own_pairs) if i == chosen)
-    return compared_row(pair, comparison.frames[chosen], comparison.exposure)
+    return compared_row(pair, comparison.images[chosen], comparison.exposure)

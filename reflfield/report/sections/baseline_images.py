@@ -137,7 +137,7 @@ def baselines_table(images: AnalysedImages) -> Table:
     return Table(
         ("image", *METRIC_HEADER),
         tuple(rows),
-        f"{images.title}: mean over {len(images.comparison.frames)} photographs.",
+        f"{images.title}: mean over {len(images.comparison.images)} photographs.",
         emphasised=(0,),
     )
 
@@ -175,11 +175,11 @@ def _baselines_figure(images: AnalysedImages, image: AnalysedImage) -> Figure:
     name, exposure = image.pair.name, images.comparison.exposure
     box = _box(image.pair)
     psnrs = {
-        baseline: _psnr_of(images.baselines[baseline]["frames"], name)
+        baseline: _psnr_of(images.baselines[baseline]["images"], name)
         for baseline in BASELINES
         if baseline in images.baselines
     }
-    of_field = next(f.psnr_ldr for f in images.comparison.frames if f.name == name)
+    of_field = next(f.psnr_ldr for f in images.comparison.images if f.name == name)
     panels = [
         Panel(_picture(image.pair.photograph, box, exposure), "photograph"),
         Panel(_picture(image.pair.relit, box, exposure), f"field, {of_field:.2f} dB"),
@@ -200,8 +200,8 @@ def _baselines_figure(images: AnalysedImages, image: AnalysedImage) -> Figure:
     )
 
 
-def _psnr_of(frames: Iterable[Mapping[str, Any]], name: str) -> float:
-    return next(float(frame["psnr_ldr"]) for frame in frames if frame["name"] == name)
+def _psnr_of(images: Iterable[Mapping[str, Any]], name: str) -> float:
+    return next(float(image["psnr_ldr"]) for image in images if image["name"] == name)
 
 
 def kinds_table(images: AnalysedImages) -> Table:
@@ -218,7 +218,7 @@ def kinds_table(images: AnalysedImages) -> Table:
     return Table(
         ("kind", "pixels", "squared error", "PSNR LDR, dB"),
         tuple(rows),
-        f"{images.title}: of {len(images.comparison.frames)} photographs together.",
+        f"{images.title}: of {len(images.comparison.images)} photographs together.",
     )
 
 

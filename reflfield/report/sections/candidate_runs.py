@@ -127,7 +127,7 @@ def _psnr(one: CandidateRun) -> float:
 
 def _compared(runs: Sequence[CandidateRun], selected: int) -> Table:
     compared = [next(iter(one.field.comparisons.values())) for one in runs]
-    psnr = np.array([[frame.psnr_ldr for frame in c.frames] for c in compared])
+    psnr = np.array([[image.psnr_ldr for image in c.images] for c in compared])
     wins = (psnr == psnr.max(axis=0)).sum(axis=1)
     rows = tuple(
         (

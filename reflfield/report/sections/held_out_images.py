@@ -36,7 +36,7 @@ ROW_PX = 480
 # FLIP errors of good results lie near 0; full scale would show black images.
 FLIP_SCALES = (0.1, 0.2, 0.3, 0.5, 1.0)
 # Fewer are better read from the table.
-FRAMES_FOR_PLOTS = 6
+IMAGES_FOR_PLOTS = 6
 FLIP_LABEL = "FLIP error, all rows; 0: indistinguishable"
 METRIC_HEADER = ("PSNR LDR, dB", "PSNR HDR, dB", "SSIM", "FLIP")
 
@@ -70,8 +70,8 @@ def held_out_section(
     InputError
         If the pairs are not those of the comparison.
     """
-    shown = {id(f) for f in _even_choice(worst_to_best(comparison.frames), max_rows)}
-    rows, measured = [], iter(comparison.frames)
+    shown = {id(f) for f in _even_choice(worst_to_best(comparison.images), max_rows)}
+    rows, measured = [], iter(comparison.images)
     for pair in pairs:
         metrics = next(measured, None)
         if metrics is None or pair.name != metrics.name:
@@ -87,7 +87,7 @@ def held_out_section(
     high = flip_scale([row.error for row in rows])
     items: list[Item] = [_notes_on(comparison)]
     items += [_row_figure(row, high, has_bar=i == 0) for i, row in enumerate(rows)]
-    if len(comparison.frames) >= FRAMES_FOR_PLOTS:
+    if len(comparison.images) >= IMAGES_FOR_PLOTS:
         items.append(_distribution(comparison))
     items.append(metrics_table(comparison))
     return Section(title, intro, tuple(items))
@@ -176,18 +176,18 @@ def measured_words(comparison: Comparison) -> str:
     text = f"Measured on {measured['pixels']} pixels of the object. Silhouettes: {words}."
     if n := measured["saturated_pixels_left_out"]:
         text += f" {n} pixels of the object are saturated in the photographs and excluded."
-    if names := measured["frames_not_measured"]:
+    if names := measured["images_not_measured"]:
         text += f" Not measured, because they show no pixel of the object: {', '.join(names)}."
     return text
 
 
 def _distribution(comparison: Comparison) -> Figure:
     ranked = {
-        "PSNR LDR": sorted(f.psnr_ldr for f in comparison.frames),
-        "PSNR HDR": sorted(f.psnr_hdr for f in comparison.frames),
+        "PSNR LDR": sorted(f.psnr_ldr for f in comparison.images),
+        "PSNR HDR": sorted(f.psnr_hdr for f in comparison.images),
     }
     curves = {name: (range(1, len(v) + 1), v) for name, v in ranked.items()}
-    flips = {"FLIP": [f.flip for f in comparison.frames]}
+    flips = {"FLIP": [f.flip for f in comparison.images]}
     return Figure(
         (
             Panel(plots.lines(curves, "photographs, worst first", "PSNR, dB"), "PSNR, sorted"),
@@ -216,7 +216,7 @@ def metrics_table(comparison: Comparison) -> Table:
     rows = [("mean", *metric_cells(mean), mean["n_pixels"])]
     rows += [
         (f.name, *metric_cells(vars(f)), float(f.n_pixels))
-        for f in worst_to_best(comparison.frames)
+        for f in worst_to_best(comparison.images)
     ]
     return Table(
         ("photograph", *METRIC_HEADER, "object pixels"),
@@ -234,11 +234,11 @@ def metric_cells(metrics: Mapping[str, Any]) -> tuple[str, str, str, str]:
     return red, green, blue, last
 
 
-def _even_choice(frames: Sequence[ImageMetrics], count: int) -> list[ImageMetrics]:
-    if len(frames) <= count:
-        return list(frames)
-    ranks = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
-    return [frames[rank] for rank in ranks]
+def _even_choice(images: Sequence[ImageMetrics], count: int) -> list[ImageMetrics]:
+    if len(images) <= count:
+        return list(images)
+    ranks = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
+    return [images[rank] for rank in ranks]
 
 
 def alignment_section(history: ArrayLike, margin: ArrayLike) -> Section:
@@ -298,16 +298,16 @@ def comparisons_table(comparisons: Mapping[str, Comparison]) -> Table:
 
 def measured_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Mean metrics in one line, and on what they were measured in another."""
-    mean, n = metrics["mean"], len(metrics["frames"])
+    mean, n = metrics["mean"], len(metrics["images"])
     measured = metrics["measured"]
     parts = [f"measured on {measured['pixels']} pixels"]
     if left_out := measured["saturated_pixels_left_out"]:
         parts.append(f"{left_out} saturated ones left out")
-    if names := measured["frames_not_measured"]:
+    if names := measured["images_not_measured"]:
         parts.append(f"without a pixel of the object: {', '.join(names)}")
     origins = ", ".join(f"{name} {n}" for name, n in measured["silhouettes"].items())
     return [
-        f"{n} frame{'' if n == 1 else 's'}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
+        f"{n} image{'' if n == 1 else 's'}: PSNR {mean['psnr_ldr']:.2f} dB (LDR), "
         f"{mean['psnr_hdr']:.2f} dB (HDR), SSIM {mean['ssim']:.4f}, FLIP {mean['flip']:.4f}",
         "; ".join([*parts, f"silhouettes: {origins}"]),
     ]

@@ -53,7 +53,7 @@ def key_numbers(
     if comparison is not None:
         mean, count = (
             comparison.mean,
-            f"mean of {len(comparison.frames)} held-out photographs",
+            f"mean of {len(comparison.images)} held-out photographs",
         )
         numbers += [
             KeyNumber("PSNR (LDR)", f"{mean['psnr_ldr']:.2f} dB", count),
