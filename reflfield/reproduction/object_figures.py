@@ -216,7 +216,7 @@ def _camera(azimuth: float) -> Camera:
 def _held_out(result: Result, capture: Capture) -> list[Panel]:
     """The first held-out photograph, and the same camera and lamp from the field."""
     names = [photograph.name for photograph in capture.photographs]
-    index = names.index(result.metrics["frames"][0]["name"])
+    index = names.index(result.metrics["images"][0]["name"])
     described, photograph = capture.photographs[index], capture.read_photograph(index)
     rendered = result.field.render(
         capture.cameras[described.camera], capture.lights[described.light]
