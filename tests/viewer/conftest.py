@@ -33,12 +33,17 @@ class Pages:
         self.browser, self.folder = browser, folder
         self.opened, self.errors = [], []
 
-    def open(self, html, fragment="", *, size=(64, 64), waits=True, errors_matter=True):
+    def open(
+        self, html, fragment="", *, size=(64, 64), waits=True, errors_matter=True, touch=False
+    ):
         """A page whose object is there; what it logs as an error counts."""
         path = self.folder / f"object{len(self.opened)}.html"
         path.write_text(html, encoding="utf-8")
         page = self.browser.new_page(
-            viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce"
+            viewport={"width": size[0], "height": size[1]},
+            reduced_motion="reduce",
+            has_touch=touch,
+            is_mobile=touch,
         )
         page.set_default_timeout(60_000)
         self.opened.append(page)
