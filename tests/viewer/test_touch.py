@@ -15,9 +15,7 @@ def only_page(open_shared_page):
     html = object_page(half_vector_field(), "two spheres")
     opened = open_shared_page(html, size=PHONE, touch=True)
     opened.evaluate("() => { reflfield.viewer().movingScale = 0.1; }")
-    opened.evaluate(
-        "() => { reflfield.viewer().refine = function () { this.refining = null; }; }"
-    )
+    opened.evaluate(NOT_REFINED)
     return opened
 
 
