@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -76,6 +77,25 @@ def read_text(path: Path) -> str:
     raise CaptureError(
         f"{path}: expected a text file (UTF-8), received {_binary_kind(content)}"
     )
+
+
+def csv_rows(path: Path, lines: Iterable[str], delimiter: str = ",") -> list[list[str]]:
+    """Words of the lines of a table, without spaces around them.
+
+    Raises
+    ------
+    CaptureError
+        If a word is longer than a table's can be, as behind a quotation mark without another.
+    """
+    try:
+        return [
+            [word.strip() for word in words] for words in csv.reader(lines, delimiter=delimiter)
+        ]
+    except csv.Error as error:
+        raise CaptureError(
+            f"{path}: expected a table of values with {quoted(delimiter)} between them, "
+            f"received a line that is none ({error}); is a quotation mark left open?"
+        ) from error
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reflfield.capture.documents import csv_rows
 from reflfield.errors import InputError
 from reflfield.util.files import read_bytes
 from reflfield.util.late_import import LateImport
@@ -211,7 +211,7 @@ def read_pairs(path: Path) -> Encoding:
 
 def _csv_rows(path: Path, text: str) -> list[tuple[float, float]]:
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    rows = [[word.strip() for word in row] for row in csv.reader(lines)]
+    rows = csv_rows(path, lines)
     heading = [word.lower() for word in rows[0]] if rows else []
     named = sorted(heading) == ["encoded", "linear"]
     step = -1 if named and heading[0] == "linear" else 1

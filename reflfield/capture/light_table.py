@@ -22,7 +22,6 @@ used.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +31,13 @@ import numpy as np
 
 from reflfield.capture.capture import Capture, Exposure, Photograph
 from reflfield.capture.described_items import described_light
-from reflfield.capture.documents import MAX_PHOTOGRAPHS, check_counts, parse_number, read_text
+from reflfield.capture.documents import (
+    MAX_PHOTOGRAPHS,
+    check_counts,
+    csv_rows,
+    parse_number,
+    read_text,
+)
 from reflfield.capture.lights import Light
 from reflfield.capture.names import IMAGE_SUFFIXES, frame_name, unique_names
 from reflfield.capture.paths import NamedFiles
@@ -271,9 +276,7 @@ def _rows(table: Path) -> tuple[list[_Row], bool]:
     lines = [line for line in lines if not line.startswith("#")]
     first = lines[0] if lines else ""
     delimiter = next((mark for mark in ",;\t" if mark in first), ",")
-    parsed = [
-        [word.strip() for word in words] for words in csv.reader(lines, delimiter=delimiter)
-    ]
+    parsed = csv_rows(table, lines, delimiter)
     columns, kind = _columns(parsed[0] if parsed else [], table)
     if not 1 <= len(parsed) - 1 <= MAX_PHOTOGRAPHS:
         raise CaptureError(

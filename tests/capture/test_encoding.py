@@ -100,7 +100,8 @@ class TestCurves:
         "text",
         ["", "1,1\n", "a,b\n1,2\n",
          "1,1\n1,2\n", "1,2\n2,1\n", "1,1\n2,nan\n", "1,1,1\n2,2,2\n",
-         "-1,-1\n2,2\n", "0,.5\n1,1\n", "\0\1\2"],
+         "-1,-1\n2,2\n", "0,.5\n1,1\n", "\0\1\2",
+         "a" * 200_000 + ",1\n"],
     )  # fmt: skip
     def test_pairs_refused(self, tmp_path, text):
         (tmp_path / "p.csv").write_text(text)

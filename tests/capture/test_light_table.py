@@ -145,6 +145,7 @@ def test_intensity_is_1_where_it_is_not_said(dome):
         ("name,x,y,z,view\nl0,1,0,2,v9\n", "photographs of one camera.*'v9', which names 0"),
         ("name,x,y,z,view\n../l0.png,1,0,2,v0_l0\n", "leaves the folder"),
         ("name,x,y,z,view\n../../l0.png,1,0,2,v0_l0\n", "leaves the folder"),
+        ('name,x,y,z\n"l0,1,0,2\n' + "l1,1,0,2\n" * 20_000, "a quotation mark left open"),
         ("name,x,y,z,view\n/etc/passwd,1,0,2,v0_l0\n", "leaves the folder|missing"),
     ],
 )
