@@ -330,13 +330,15 @@ def naming(path: Path | str) -> Iterator[None]:
 def filling(folder: Path) -> Iterator[Path]:
     """Yield a new folder whose files go to `folder` if the block succeeds, else vanish.
 
-    After an error `folder` is as it was: absent, or with what it held.
+    After an error `folder` is as it was: absent, or with what it held. An error of the system
+    that names no file, as of a full disk, names the folder.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=".", suffix=".partial", dir=folder))
     try:
-        yield partial
+        with naming(folder):
+            yield partial
         for file in sorted(path for path in partial.rglob("*") if path.is_file()):
             target = folder / file.relative_to(partial)
             target.parent.mkdir(parents=True, exist_ok=True)

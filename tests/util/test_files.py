@@ -2,12 +2,13 @@
 
 import os
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from reflfield.errors import CaptureError, InputError
-from reflfield.util.files import check_regular, load_arrays, read_bytes, replacing
+from reflfield.util.files import check_regular, filling, load_arrays, read_bytes, replacing
 
 MOST = 1 << 20
 
@@ -87,6 +88,17 @@ def says_or_reads(path):
     except InputError as error:
         return path.name in str(error)
     return all(array.shape == (50,) for array in loaded.values())
+
+
+@pytest.mark.parametrize("writing", [replacing, filling])
+def test_a_full_disk_is_named_where_the_system_names_nothing(tmp_path, writing):
+    def fill():
+        with writing(tmp_path / "x"), Path("/dev/full").open("w") as full:
+            full.write("a")
+
+    with pytest.raises(OSError, match=r"No space left on device: '.*/x'"):
+        fill()
+    assert not list(tmp_path.iterdir())
 
 
 def test_failed_write_leaves_the_earlier_file(tmp_path):
