@@ -87,8 +87,8 @@ def start_model(
     if best is None:
         raise InputError(
             f"observed: expected a column of which {reader.least_coverage:.0%} was observed, "
-            "received none; there is nothing to complete from: check silhouettes, cameras and "
-            "exposure"
+            "received none; there is nothing to complete from: check silhouettes, cameras, "
+            "lights and exposure"
         )
     floor, model, posterior, data = best
     return _extended(model, posterior, data), floor
