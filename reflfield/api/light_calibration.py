@@ -49,7 +49,7 @@ def light_references(
     """
     for name, value in (("radius", radius), ("focal", focal)):
         if value is not None and not 0 < value < 1e12:
-            raise InputError(f"{name}: expected a number above 0, received {value}")
+            raise InputError(f"{name}: expected a number above 0, below 1e12, received {value}")
     n_sought = sum(text == AUTO for text in spheres)
     if 0 < n_sought < len(spheres):
         raise InputError("sphere: expected x,y,r of all spheres, or 'auto' for all")

@@ -46,6 +46,24 @@ class Circle:
         """The circle in an image that is so many times as large."""
         return Circle(self.x * factor, self.y * factor, self.radius * factor)
 
+    def check_within(self, width: int, height: int) -> None:
+        """Demand a circle that holds pixels of an image and is no larger than it.
+
+        Raises
+        ------
+        InputError
+        """
+        nearest = [
+            np.clip(np.floor(place) + 0.5, 0.5, size - 0.5)
+            for place, size in ((self.x, width), (self.y, height))
+        ]
+        off = np.hypot(nearest[0] - self.x, nearest[1] - self.y)
+        if not (off < self.radius <= max(width, height)):
+            raise InputError(
+                f"sphere: expected a circle in the image of {width} x {height} pixels, "
+                f"received {self.x:g},{self.y:g},{self.radius:g}"
+            )
+
 
 def parse_circle(text: str) -> Circle:
     """A circle from ``x,y,r``.

@@ -62,14 +62,14 @@ def light_on_matt_sphere(
     usable = inside & measured
     bright = image[usable].astype(np.float64)
     facing = normals[usable]
-    if direction is None:
+    if direction is None and len(bright) >= FEWEST_PIXELS:
         direction = _direction(facing, bright.mean(axis=1))
-    cosine = facing @ direction
+    cosine = np.zeros(len(facing)) if direction is None else facing @ direction
     lit = cosine > LEAST_COSINE
-    if lit.sum() < FEWEST_PIXELS:
+    if direction is None or lit.sum() < FEWEST_PIXELS:
         raise InputError(
             f"matt_sphere: expected a sphere lit from the front, received {int(lit.sum())} lit "
-            "pixels; is the circle the sphere's outline?"
+            "pixels that are not saturated; is the circle the sphere's outline?"
         )
     strength = np.median(bright[lit] / cosine[lit, None], axis=0)
     return MattLight(direction, strength)

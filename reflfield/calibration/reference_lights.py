@@ -172,13 +172,15 @@ def _light(
     references: References,
 ) -> CalibratedLight:
     height, width = image.shape[:2]
+    matt = references.matt_sphere
+    for circle in (*references.spheres, *([matt] if matt else [])):
+        circle.check_within(width, height)
     camera = SphereCamera(width, height, references.focal, references.radius)
     luminance = np.asarray(image @ LUMINANCE, np.float32)
     rays = [camera.ray_to_light(c, highlight(luminance, c)) for c in references.spheres]
     position = meeting_point(rays) if len(rays) > 1 else None
     direction, spread = _mean_direction(rays)
     strength: Array | None = None
-    matt = references.matt_sphere
     if matt is not None:
         known = direction if rays else None
         if position is not None:
@@ -249,7 +251,18 @@ def write_lights(folder: Path, lights: Sequence[CalibratedLight]) -> tuple[Path,
 
     The table has columns name,x,y,z,intensity of positions, or name,dx,dy,dz,intensity of
     directions to distant lights, as `lights.csv` beside cameras of any format has.
+
+    Raises
+    ------
+    InputError
+        If there is one of them already: it may be from a drawing.
     """
+    there = [folder / name for name in (TABLE, DIRECTIONS) if (folder / name).exists()]
+    if there:
+        raise InputError(
+            f"{there[0]}: expected no such file, received one; choose another folder, or "
+            "remove it"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     near = lights[0].position is not None
     text = io.StringIO()

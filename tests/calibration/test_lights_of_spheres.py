@@ -6,7 +6,7 @@ import pytest
 from reflfield.api.light_calibration import light_references, lights_of_photographs
 from reflfield.calibration.circles import Circle, find_circles, parse_circle
 from reflfield.calibration.reference_lights import write_lights
-from reflfield.capture.image_writing import write_exr
+from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.errors import InputError
 
 SIZE = 240
@@ -119,6 +119,30 @@ def test_what_is_no_circle_is_refused(words):
 def test_a_sphere_without_a_highlight_is_refused_by_name(folder):
     with pytest.raises(InputError, match=r"l0\.exr: sphere: expected a"):
         lights_of_photographs([folder], light_references([text(MATT)]))
+
+
+@pytest.mark.parametrize("circle", ["9,9,1e9", "9,9,1e300", "1e9,9,3", "9,9,1e-9"])
+@pytest.mark.parametrize("kind", ["sphere", "matt_sphere"])
+def test_circles_beyond_the_image_are_refused_at_once(folder, circle, kind):
+    """Their blur would take gigabytes."""
+    asked = {"spheres": [circle]} if kind == "sphere" else {"spheres": [], kind: circle}
+    with pytest.raises(InputError, match="sphere: expected a circle in the image"):
+        lights_of_photographs([folder], light_references(**asked))
+
+
+def test_a_matt_sphere_that_is_saturated_is_refused(tmp_path):
+    write_png(tmp_path / "a.png", np.full((SIZE, SIZE, 3), 255, np.uint8))
+    with pytest.raises(InputError, match=r"a\.png: matt_sphere: .* 0 lit pixels"):
+        lights_of_photographs([tmp_path], light_references([], matt_sphere=text(MATT)))
+
+
+def test_a_table_of_others_stays(folder, tmp_path):
+    lights, _ = lights_of_photographs([folder], light_references([text(LEFT)]))
+    write_lights(tmp_path / "new", lights)
+    (tmp_path / "lights.csv").write_text("from a drawing")
+    with pytest.raises(InputError, match=r"lights\.csv: expected no such file"):
+        write_lights(tmp_path, lights)
+    assert (tmp_path / "lights.csv").read_text() == "from a drawing"
 
 
 def test_given_directions_of_chrome_spheres_are_met(shared_data):
