@@ -61,10 +61,16 @@ def write_comparison_with(
     Raises
     ------
     InputError
-        If no photograph can be compared, or a file of the capture would be replaced.
+        If no photograph can be compared, or a file of the capture or the results of a run
+        would be replaced.
     NumericalError
         If what the field shows is not finite.
     """
+    if (out / "stages").is_dir():
+        raise InputError(
+            f"out: expected a folder of its own, received {out}, where metrics and report are "
+            "those of a run; choose another"
+        )
     pages = [out / "metrics.json", out / "report" / "index.html"]
     check_kept(capture, [*pages, *image_files(capture, out / "relit")])
     with TemporaryDirectory() as scratch, filling(out) as partial:

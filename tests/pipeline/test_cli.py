@@ -175,6 +175,15 @@ def test_compare_prints_and_writes_metrics(reflfield, finished, tiny_capture, tm
     assert (out / "report" / "index.html").is_file()
 
 
+def test_compare_replaces_no_results_of_a_run(reflfield, run_copy, tiny_capture):
+    metrics = (run_copy / "metrics.json").read_bytes()
+    frames = tiny_capture / "truth" / "heldout.json"
+    outcome = reflfield("compare", run_copy / "field.rfld", frames, "-o", run_copy)
+    assert outcome.status == 2
+    assert "--out: expected a folder of its own" in outcome.err
+    assert (run_copy / "metrics.json").read_bytes() == metrics
+
+
 class TestNothingIsLeftAfterAnError:
     """What was in the folder before stays, and nothing else is there."""
 
