@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 
+from reflfield.capture.inspect import object_centre
 from reflfield.capture.readers import open_capture
 from reflfield.checking.capture_check import measures
 from reflfield.checking.check_report import write_findings
@@ -45,6 +46,23 @@ def test_one_light_for_each_view_raises_no_alarm(planted, subset_of, check_folde
     n_views, n_lights = 20, 13
     subset_of(planted, [(v, (5 * v) % n_lights) for v in range(n_views)])
     assert grave(check_folder(planted.folder)) == set()
+
+
+def test_lights_behind_the_object_of_their_view_are_not_called_dead(planted, subset_of):
+    """A hand-held lamp: of each light one photograph, half of them from behind."""
+    capture = open_capture(planted.folder)
+    centre = object_centre(capture)
+    lights = np.array([light.position - centre for light in capture.lights])
+    views = np.array([camera.centre - centre for camera in capture.cameras])
+    order = np.argsort(lights @ views.T, axis=1)
+    subset_of(planted, [(int(o[0 if i % 2 else -1]), i) for i, o in enumerate(order)])
+    assert quick_check(open_capture(planted.folder)) == []
+
+
+def test_a_dead_light_is_named_before_a_run(planted):
+    f.kill_light(planted, 4, np.random.default_rng(1))
+    (finding,) = quick_check(open_capture(planted.folder))
+    assert (finding.kind, finding.subjects) == ("dead light", ("l004",))
 
 
 def test_sparse_pairs_raise_no_alarm(planted, subset_of, check_folder):
