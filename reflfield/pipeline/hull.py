@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from reflfield.errors import GeometryError
 from reflfield.geometry.mesh import Mesh, write_ply
 from reflfield.geometry.occlusion import cameras_inside, check_light_outside
 from reflfield.geometry.plane import image_plane
@@ -40,7 +41,7 @@ def write_hull(context: Context, folder: Path) -> dict[str, Any]:
             "small parts left out": sum(hull.specks.values()),
             "median overlap with the silhouettes": float(np.median(hull.overlap)),
             "least overlap with a silhouette": float(hull.overlap.min()),
-            WARNINGS: list(hull.warnings),
+            WARNINGS: [*hull.warnings, *_made_among(context, hull)],
         }
     scene = RayScene(mesh)
     for light in context.training.lights:
@@ -59,11 +60,36 @@ def _carved(context: Context, folder: Path) -> tuple[Mesh, HullReport]:
     """Visual hull; what does not fit into memory is kept in the folder meanwhile."""
     cameras, options = context.training.cameras, context.options.hull
     silhouettes = results.silhouettes(context)
-    made = context.training.silhouette_origin(0) == "photographs"
-    if keeps_distances(context):
-        return visual_hull(cameras, silhouettes, options, made=made)
-    with TemporaryDirectory(dir=folder) as scratch:
-        return visual_hull(cameras, silhouettes, options, scratch=Path(scratch), made=made)
+    made = _is_made(context, 0)
+    try:
+        if keeps_distances(context):
+            return visual_hull(cameras, silhouettes, options, made=made)
+        with TemporaryDirectory(dir=folder) as scratch:
+            return visual_hull(cameras, silhouettes, options, scratch=Path(scratch), made=made)
+    except GeometryError as error:
+        if made:
+            raise GeometryError(f"{error}; {_MADE}") from error
+        raise
+
+
+# What to do about silhouettes that nobody gave.
+_MADE = (
+    "no masks were given, and those made from the photographs may miss dark parts or hold "
+    "some of the backdrop; give masks (`reflfield masks` makes them by the hull of all views)"
+)
+
+
+def _made_among(context: Context, hull: HullReport) -> list[str]:
+    """A warning where views that contradict the others were given no masks."""
+    said = {contradiction.view for contradiction in hull.contradictions}
+    views = [i for i, camera in enumerate(context.training.cameras) if camera.id in said]
+    made = [context.training.cameras[i].id for i in views if _is_made(context, i)]
+    return [f"{listed(made)}: {_MADE}"] if made else []
+
+
+def _is_made(context: Context, view: int) -> bool:
+    """Whether the silhouette of a view is made from its photographs."""
+    return context.training.silhouette_origin(view) == "photographs"
 
 
 def _listed(value: Any) -> Any:

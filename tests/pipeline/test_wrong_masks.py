@@ -6,6 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from reflfield.capture.image_files import read_image
+from reflfield.capture.image_writing import write_exr
+
 
 @pytest.fixture(scope="module")
 def said_of_inverted():
@@ -49,3 +52,30 @@ def test_masks_that_are_all_inverted_stop_the_run(capture_copy, run_tiny, tmp_pa
     run = run_tiny(tmp_path / "out", "--until", "hull", capture=capture_copy)
     assert run.status == 2
     assert "all are inverted (white must mean object)" in run.err
+
+
+@pytest.fixture
+def shifted(capture_copy, described):
+    """Capture without masks, whose fifth camera saw the ball elsewhere."""
+    described(capture_copy, lambda d: [camera.pop("silhouette") for camera in d["cameras"]])
+    for path in (capture_copy / "photographs").glob("v004_*.exr"):
+        write_exr(path, np.roll(read_image(path), 8, axis=1))
+    return capture_copy
+
+
+def test_contradictions_of_silhouettes_that_were_made_ask_for_masks(
+    shifted, run_tiny, tmp_path
+):
+    run = run_tiny(tmp_path / "out", "--until", "hull", capture=shifted)
+    assert run.status == 0
+    assert "v004: its silhouette contradicts the 8 others" in run.err
+    assert "v004: no masks were given" in run.err
+
+
+def test_a_hull_that_made_silhouettes_do_not_bound_asks_for_masks(shifted, run_tiny, tmp_path):
+    for path in (shifted / "photographs").iterdir():
+        away = 3 * (int(path.stem[1:4]) % 3)
+        write_exr(path, np.roll(read_image(path), away, axis=1))
+    run = run_tiny(tmp_path / "out", "--until", "hull", capture=shifted)
+    assert run.status == 2
+    assert "no masks were given" in run.err
