@@ -37,6 +37,10 @@ LEAST_HALF_VECTOR, LEAST_OF_FEW, FEW = 8, 64, 6
 # texel's nearest samples. A bowl that its hull closes with a lid has .99, and unseen images of
 # it are 4 dB better with clusters; of objects that the model shows better .86 (Spot) is most.
 LEAST_GAIN = 0.93
+# Share of all pairs of view and light that were photographed, below which clusters are never
+# preferred: a flash photographs one light from each view, and what completes a texel over all
+# pairs would be a guess, for hours.
+LEAST_SHARE_OF_PAIRS = 0.1
 
 
 @dataclass(frozen=True)
@@ -132,11 +136,21 @@ def _supports_half_vector(context: Context, visibility: str) -> bool:
 
 
 def nearest_samples_do(context: Context) -> bool:
-    """Whether nearest samples show views left out about as well as the half-vector model."""
+    """Whether nearest samples show views left out about as well as the half-vector model.
+
+    Never of photographs that are few among all pairs of view and light.
+    """
     measured = results.left_out_errors(context)
     if measured is None or not measured["errors"].any():
         return False
+    if share_of_pairs(context) < LEAST_SHARE_OF_PAIRS:
+        return False
     return bool(measured["errors"].min() > LEAST_GAIN * measured["nearest"])
+
+
+def share_of_pairs(context: Context) -> float:
+    """Share of the pairs of view and light that were photographed."""
+    return float(np.mean(context.training.photograph_index >= 0))
 
 
 def least_samples(context: Context) -> int:

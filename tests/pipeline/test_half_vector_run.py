@@ -165,6 +165,33 @@ def test_auto_takes_clusters_where_nearest_samples_show_as_much(
     assert any(said in text for text in model_selection.sentences(selected))
 
 
+def test_a_flash_never_gets_clusters(
+    capture_copy, described, tmp_path, context_of, monkeypatch
+):
+    """Of one light for each view, clusters would be completed over pairs that all lack."""
+    options = replace(OPTIONS, compression=CompressionOptions(model="auto"))
+    measured = {"errors": np.array([0.0839]), "nearest": np.array(0.0850)}
+    monkeypatch.setattr(model_selection, "samples_per_texel", lambda context: 100)
+    monkeypatch.setattr(model_selection.results, "left_out_errors", lambda context: measured)
+
+    def edit(document):
+        lights = [light["id"] for light in document["lights"]]
+        cameras = [camera["id"] for camera in document["cameras"]]
+        document["photographs"] = [
+            {"camera": camera, "light": light, "file": f"photographs/{camera}_{light}.exr"}
+            for i, camera in enumerate(cameras)
+            for light in [lights[i % len(lights)]]
+        ]
+        document.pop("truth", None)
+
+    described(capture_copy, edit)
+    context = context_of(open_capture(capture_copy), tmp_path, options)
+    n_lights = context.training.n_lights
+    assert model_selection.share_of_pairs(context) == pytest.approx(1 / n_lights)
+    monkeypatch.setattr(model_selection, "LEAST_SHARE_OF_PAIRS", 1.5 / n_lights)
+    assert model_selection.candidates(context)[0].model == "half_vector"
+
+
 @pytest.mark.slow
 def test_the_number_of_lobes_is_of_the_views_left_out(tiny_capture, tmp_path):
     model = CompressionOptions(model="half_vector")
