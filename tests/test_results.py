@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(Path(__file__).parent))
 
-from benchmarks import make_results, measuring  # noqa: E402
+from benchmarks import error_against_time, make_results, measuring  # noqa: E402
 from test_layers import PACKAGES  # noqa: E402
 
 from reflfield.pipeline.stages import ORDER, STAGES  # noqa: E402
@@ -199,3 +199,34 @@ def test_check_says_what_is_not_as_made():
         [sys.executable, str(script), "--check"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_pictures_show_error_against_time_for_what_was_measured():
+    rows = [
+        {"method": "ours, 2 passes", "error": 0.01, "CPU, s": 2.0},
+        {"method": "ours, 1 pass", "error": 0.1, "CPU, s": 1.0},
+        {"method": "(bound: known)", "error": 0.001, "CPU, s": 1.0},
+    ]
+    tables = [{"title": "completion, hemispheric, 9 x 8", "rows": rows}]
+    drawn = error_against_time.pictures([{"name": "factorization", "tables": tables}])
+    assert list(drawn) == ["factorization.svg"]
+    assert drawn["factorization.svg"].startswith("<?xml")
+    none = [{"name": "factorization", "tables": [{"title": "local PCA", "rows": []}]}]
+    assert error_against_time.pictures(none) == {}
+
+
+def test_fits_are_joined_from_the_papers_to_the_default(monkeypatch):
+    """An order by time would join a slow poor method to a fast good one."""
+    rows = [
+        {"capture": "vase", "images": images, "method": m, "PSNR, dB": 1.0, "CPU time, s": 1.0}
+        for images in ("unseen", "held out")
+        for m in ("default", "paper", "clusters, not aligned", "clusters")
+    ]
+    seen = {}
+    monkeypatch.setattr(
+        error_against_time.plots,
+        "marked_curves",
+        lambda series, *_, **words: seen.update(series),
+    )
+    error_against_time.fit_picture([{"rows": rows}])
+    assert [mark.label for mark in seen["vase"]] == ["paper", "clusters", "default"]

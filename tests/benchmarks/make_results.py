@@ -1,4 +1,4 @@
-"""RESULTS.md and the README's table of results, from the figures in results/.
+"""RESULTS.md, its pictures and the README's table of results, from the figures in results/.
 
     python tests/benchmarks/make_results.py            # write both
     python tests/benchmarks/make_results.py --check    # status 1 if they are something else
@@ -21,9 +21,10 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
+from benchmarks.error_against_time import pictures  # noqa: E402
 from benchmarks.measuring import KEYS, RESULTS, ROOT  # noqa: E402
 
-PAGE, README = HERE / "RESULTS.md", ROOT / "README.md"
+PAGE, README, PICTURES = HERE / "RESULTS.md", ROOT / "README.md", HERE / "pictures"
 HEAD = """# Results
 
 Written by `python tests/benchmarks/make_results.py` from `results/*.json`; do not edit. Each
@@ -45,10 +46,13 @@ def main():
     options = parser.parse_args()
     wanted, different = pages(load_results()), []
     for path, text in wanted.items():
+        if options.check and path.parent == PICTURES:
+            continue  # another version of the library draws other bytes
         now = path.read_text(encoding="utf-8") if path.is_file() else ""
         if without_marks(now) != without_marks(text):
             different.append(path.relative_to(ROOT))
         if not options.check:
+            path.parent.mkdir(exist_ok=True)
             path.write_text(text, encoding="utf-8")
     for line in marks(wanted[PAGE]):
         print(line)
@@ -57,10 +61,12 @@ def main():
 
 
 def pages(results):
-    """Text of both pages by path."""
+    """Text of both pages, and of the pictures of the first, by path."""
+    drawn = pictures(results)
     return {
-        PAGE: page(results),
+        PAGE: page(results, drawn),
         README: with_table(README.read_text(encoding="utf-8"), readme_table(results)),
+        **{PICTURES / name: text for name, text in drawn.items()},
     }
 
 
@@ -126,13 +132,13 @@ def without_marks(text):
 # --- RESULTS.md -------------------------------------------------------------------------------
 
 
-def page(results):
-    """The whole page."""
-    return "\n".join([HEAD, *(section(result) for result in results)])
+def page(results, drawn=()):
+    """The whole page; `drawn` has the names of its pictures."""
+    return "\n".join([HEAD, *(section(result, drawn) for result in results)])
 
 
-def section(result):
-    """One heading, with what was measured where, and the tables."""
+def section(result, drawn=()):
+    """One heading, with what was measured where, the picture and the tables."""
     machine, versions = result["machine"], result["versions"]
     said = ", ".join(f"{name} {versions[name]}" for name in PACKAGES if name in versions)
     lines = [
@@ -143,6 +149,8 @@ def section(result):
         f"{machine.get('load', 'unknown')}; {said}.\n",
         *(f"{line}\n" for line in mark(result)),
     ]
+    if (picture := f"{result['name']}.svg") in drawn:
+        lines.append(f"![Error against time]({PICTURES.name}/{picture})\n")
     for table in result["tables"]:
         title = [f"{table['title']}:\n"] if table["title"] else []
         lines += [*title, markdown(table["rows"])]
