@@ -9,8 +9,8 @@ many bytes. "half vector, samples" is the half-vector model fitted to samples of
 "half vector, photographs" to the photographs on the hull; the default moves the hull to the
 normals besides. "paper" is the pipeline of Müller, Sarlette and Klein 2006: samples resampled
 onto a grid, completed and aligned, and local PCA of 16 clusters with 10 components, fitted to
-the grid alone. All are compared with the same held-out photographs, and with those of views and
-lights that are not in the capture where it has some. Times are of the stages that a field needs.
+the grid alone. All are compared with the same held-out photographs, and with those of views
+and lights that are not in the capture where it has some. Times are of stages that fields need.
 
 Writes results/methods.json.
 """
