@@ -32,6 +32,8 @@ CASES = {
         "correlation against the direct sum",
         "noise, and half the samples unobserved",
         "a maximum behind a saddle",
+        "any functions",
+        "any samples of texels",
     ),
     ("alignment page", "sphere"): (
         "Wigner d of degree 256",
