@@ -95,7 +95,7 @@ def test_no_rotation_beats_the_one_that_the_search_finds(dtype, bounded):
         planted,
         max(1e3 * precision, 1e-8),
         quantity="1 less the score of a turned copy",
-        source="the same; on a ridge Newton's steps end within 1e-4 radians, which counts squared",
+        source="the same; on a ridge Newton's steps end within 1e-4 radians, squared",
         **about,
     )
 
