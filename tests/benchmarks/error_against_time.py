@@ -1,8 +1,8 @@
 """Pictures of error against time for RESULTS.md, from the figures in results/.
 
 Three stages: the alignment (`bench_accuracy.py`), the completion of missing samples
-(`bench_factorization.py`) and the fit of a field (`bench_methods.py`). `make_results.py` draws
-them; nothing is measured here.
+(`bench_factorization.py`) and the fit of a field (`bench_methods.py`); and whole runs with
+other options (`bench_sweeps.py`). `make_results.py` draws them; nothing is measured here.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ def pictures(results):
         ("accuracy", alignment_picture),
         ("factorization", completion_picture),
         ("methods", fit_picture),
+        ("sweeps", sweep_picture),
     ):
         if name in by_name and (picture := draw(by_name[name]["tables"])) is not None:
             drawn[f"{name}.svg"] = picture.data.decode("utf-8")
@@ -79,3 +80,15 @@ def fit_picture(tables):
         marks.sort(key=lambda mark: FITS.index(mark.label))
     label = "PSNR of unseen views and lights, dB"
     return plots.marked_curves(series, CPU, label, joined=tuple(series)) if series else None
+
+
+def sweep_picture(tables):
+    """Gain over the default of all configurations of a sweep, over their share of its time."""
+    series = {}
+    for row in tables[1]["rows"]:
+        mark = plots.Mark(
+            row["of the default's"], row["gain, dB"], is_ringed=row["part"] == "default"
+        )
+        series.setdefault(row["capture"], []).append(mark)
+    x_label, y_label = "CPU time over the default's", "PSNR over the default's, dB"
+    return plots.marked_curves(series, x_label, y_label, log_x=True) if series else None
