@@ -10,6 +10,7 @@ from reflfield.field.array_coding import (
     CONTEXT_BITS,
     FILTERS,
     LARGE_BYTES,
+    SHORT_DISTANCE,
     pack,
     packed_array,
     unpack,
@@ -55,3 +56,14 @@ def test_way_of_a_large_array_is_that_of_its_first_rows(rng):
     assert packed.filter == "delta"
     again = unpack(packed.content, ramp.dtype, ramp.shape, packed.filter, packed.context_bits)
     assert again.tobytes() == ramp.tobytes()
+
+
+def test_large_arrays_repeat_themselves_over_a_short_distance_alone(rng):
+    """Matches are looked for in the cache, whatever the size; any reader can read them."""
+    block = rng.integers(-128, 128, (SHORT_DISTANCE * 2, 1)).astype(np.int8)
+    array = np.tile(block, (-(-LARGE_BYTES // len(block)) + 1, 1))
+    packed = pack(array, "none", 0)
+    assert len(packed) > 0.9 * array.nbytes
+    np.testing.assert_array_equal(unpack(packed, array.dtype, array.shape, "none", 0), array)
+    few = array[: 3 * len(block)]
+    assert len(pack(few, "none", 0)) < 0.5 * few.nbytes
