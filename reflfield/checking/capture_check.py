@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,8 @@ Array = NDArray[np.float64]
 
 # Photographs that are looked at for the axes of all lights.
 MOST_LOOKS = 64
+# Brightness over what is expected of a photograph, or a light, that shows nothing.
+DARK = 0.05
 # Kinds of finding on photographs that do not show what they should.
 OUT_OF_PLACE = (
     *("swapped photographs", "photograph of another light", "odd photograph"),
@@ -193,7 +196,7 @@ def _of_surface(
             ERROR,
             (),
             axes,
-            "correct the lights' positions or the axes they are in",
+            "correct the lights' positions, their order, or the axes they are in",
             str(capture.description or ""),
         )
         return
@@ -227,6 +230,9 @@ def _of_shading(
     wrong = _misplaced(capture, photographs, coverage, shading, by_fit.fits, towards)
     yield from order_findings(capture, wrong, towards)
     wrong_lights = {one.light for one in wrong}
+    if 0 < len(wrong_lights) <= capture.n_lights // 2:
+        by_fit = _without_lights(by_fit, wrong_lights)
+        shading = by_fit.shading
     wrong_photographs: set[int] = set()
     dark = _dark(shading)
     for indices, finding in misplaced_photographs(by_fit, wrong_lights, dark):
@@ -247,9 +253,21 @@ def _of_shading(
     yield from vignetting_findings(shading, capture)
 
 
+def _without_lights(by_fit: PhotographFits, lights: set[int]) -> PhotographFits:
+    """Fits of the other lights' photographs, to albedo that these say nothing of."""
+    capture, samples = by_fit.capture, by_fit.shading.samples
+    luminance = {
+        index: values
+        for index, values in samples.luminance.items()
+        if capture.photographs[index].light not in lights
+    }
+    shading = shading_of(capture, replace(samples, luminance=luminance))
+    return PhotographFits(capture, by_fit.photographs, shading, shading.fits())
+
+
 def _dark(shading: Shading) -> frozenset[int]:
     """Photographs that are far darker than expected: noise says nothing of their place."""
-    rows = np.flatnonzero(shading.gains < np.log(0.05))
+    rows = np.flatnonzero(shading.gains < np.log(DARK))
     return frozenset(int(shading.photographs[row]) for row in rows)
 
 
@@ -276,8 +294,15 @@ def _misplaced(
 
 
 def _dead_lights(capture: Capture, shading: Shading) -> set[int]:
-    dark = _dark(shading)
-    return {capture.photographs[index].light for index in dark}
+    """Lights all of whose photographs are dark.
+
+    A light that stands elsewhere leaves dark what it should light, but it lights something.
+    """
+    lights = np.array([capture.photographs[int(i)].light for i in shading.photographs])
+    known = np.nan_to_num(shading.peaks, nan=-np.inf)
+    peaks = {int(light): float(known[lights == light].max()) for light in np.unique(lights)}
+    darkest = float(np.median(list(peaks.values()))) + np.log(DARK)
+    return {light for light, peak in peaks.items() if peak < darkest}
 
 
 def _likeness(

@@ -62,13 +62,20 @@ def misplaced_lights(fit: LightFit, directions: Array) -> list[Misplaced]:
         and min(regret[light], regret[better]) > MUTUAL_REGRET
         and max(own[light], own[better]) < usual - LEAST_LOSS
     }
-    return [
-        Misplaced(light, better, float(own[light]), other)
+    wrong = {
+        light: Misplaced(light, better, float(own[light]), other)
         for light, (better, other) in enumerate(others)
         if regret[light] > LEAST_REGRET
         and (own[light] < lowest or light in mutual)
         and directions[light] @ directions[better] < np.cos(LEAST_ANGLE)
-    ]
+    }
+    # Of two that are exchanged one may lose little, as a light overhead does.
+    for one in list(wrong.values()):
+        place, fit_there = others[one.better]
+        if one.better not in wrong and place == one.light and regret[one.better] > 0:
+            partner = one.better
+            wrong[partner] = Misplaced(partner, place, float(own[partner]), fit_there)
+    return [wrong[light] for light in sorted(wrong)]
 
 
 def order_findings(

@@ -46,6 +46,8 @@ class Shading:
     scatter : (n,) float64
         Robust standard deviations of the logarithms of each photograph's samples around this
         model.
+    peaks : (n,) float64
+        Logarithms of the brightest tenth of luminance over albedo, wherever the light stands.
     samples : SurfaceSamples
     """
 
@@ -53,6 +55,7 @@ class Shading:
     gains: Array
     albedo: Array
     scatter: Array
+    peaks: Array
     samples: SurfaceSamples
 
     def fit_to_lights(self, luminance: NDArray[np.floating]) -> Array:
@@ -98,7 +101,8 @@ def shading_of(capture: Capture, samples: SurfaceSamples) -> Shading:
     left = ratio - albedo - gains[:, None]
     scatter = 1.4826 * nanmedian(np.abs(left), axis=1)
     gains[~usable.any(axis=1)] = np.nan
-    return Shading(photographs, gains, albedo, scatter, samples)
+    peaks = nanquantile(np.log(np.maximum(luminance, 1e-300)) - albedo, 0.9)
+    return Shading(photographs, gains, albedo, scatter, peaks, samples)
 
 
 def light_means(
@@ -118,6 +122,14 @@ def nanmedian(values: Array, axis: int) -> Array:
         warnings.simplefilter("ignore", RuntimeWarning)
         median: Array = np.nanmedian(values, axis=axis)
     return median
+
+
+def nanquantile(values: Array, share: float) -> Array:
+    """Quantile of what is known of each row; NaN, without a warning, where nothing is."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        quantile: Array = np.nanquantile(values, share, axis=1)
+    return quantile
 
 
 def nanmean(values: Array) -> Array:
