@@ -39,7 +39,7 @@ def spread(count: int, wanted: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, min(wanted, count))})
 
 
-def frame_scale(photograph: NDArray[np.floating]) -> float:
+def photograph_scale(photograph: NDArray[np.floating]) -> float:
     """The 99th percentile of the values of a photograph that are not black.
 
     Parameters
@@ -55,7 +55,7 @@ def frame_scale(photograph: NDArray[np.floating]) -> float:
     --------
     >>> image = np.zeros((10, 10, 3))
     >>> image[:5] = 2.0
-    >>> frame_scale(image)
+    >>> photograph_scale(image)
     2.0
     """
     values = photograph[photograph > 0.0]
@@ -75,7 +75,7 @@ def relative_change(photograph: NDArray[np.floating], changed: NDArray[np.floati
         0 if both are the same; infinite if only the first is black.
     """
     difference = float(np.abs(photograph.astype(np.float64) - changed).max(initial=0.0))
-    scale = frame_scale(photograph)
+    scale = photograph_scale(photograph)
     if difference == 0.0:
         return 0.0
     return difference / scale if scale > 0.0 else float("inf")
@@ -108,7 +108,7 @@ def _brightness(scene: Scene, tracer: RayTracer) -> Brightness:
     for index in spread(len(scene.cameras), SAMPLE_VIEWS):
         view = sample_view(plain, tracer, coarser(scene.cameras[index]))
         for image in shade(plain, tracer, view, lights):
-            scales.append(frame_scale(image))
+            scales.append(photograph_scale(image))
             peaks.append(float(image.max()))
     return _summary(np.array(scales), np.array(peaks), dark_noise(scene))
 

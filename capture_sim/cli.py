@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
@@ -194,6 +195,9 @@ def _console() -> Console:
 
 def main() -> None:
     """Run the command; scenes and files that cannot be used end with status 2."""
+    notes, handler = logging.getLogger("capture_sim"), Notes()
+    notes.addHandler(handler)
+    notes.propagate = False
     try:
         app()
     except SceneError as error:
@@ -202,6 +206,17 @@ def main() -> None:
         _fail(f"{error.filename or 'system'}: {error.strerror or error}")
     except MemoryError:
         _fail("system: expected more memory, received none; lower --max-memory or --workers")
+    finally:
+        notes.removeHandler(handler)
+        notes.propagate = True
+
+
+class Notes(logging.Handler):
+    """Says what the simulator notes on the way, such as an old name in a scene."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Say one note on one line."""
+        print(f"capture-sim: note: {shown(record.getMessage())}", file=sys.stderr)
 
 
 def _fail(message: str) -> NoReturn:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from capture_sim.brightness import relative_change, spread
 from capture_sim.effects import (
     Effect,
-    Frame,
+    Photograph,
     Stage,
     dropped_photographs,
     exposure_brackets,
@@ -140,8 +140,8 @@ def arriving(scene: Scene, tracer: RayTracer, pairs: list[Pair]) -> tuple[Images
     images: dict[Pair, Float32] = {}
     for view in sorted({view for view, _ in pairs}):
         lights = np.array(sorted(light for v, light in pairs if v == view), dtype=np.intp)
-        for frame, radiance in photographs(real, tracer, view, lights):
-            images[view, frame.light] = radiance
+        for photograph, radiance in photographs(real, tracer, view, lights):
+            images[view, photograph.light] = radiance
     return images, time.process_time() - start
 
 
@@ -150,7 +150,7 @@ def _of_sensor(scene: Scene, effect: Effect, images: Images) -> Contribution:
     alone = replace(scene, effects=replace(scene.effects, active=frozenset({effect.NAME})))
     start = time.process_time()
     recorded = {
-        pair: _recorded(alone, image, Frame(alone.cameras[pair[0]], *pair))
+        pair: _recorded(alone, image, Photograph(alone.cameras[pair[0]], *pair))
         for pair, image in images.items()
     }
     seconds = (time.process_time() - start) / len(images)
@@ -159,9 +159,9 @@ def _of_sensor(scene: Scene, effect: Effect, images: Images) -> Contribution:
     return replace(contribution, change=change)
 
 
-def _recorded(scene: Scene, image: Float32, frame: Frame) -> Float32:
+def _recorded(scene: Scene, image: Float32, photograph: Photograph) -> Float32:
     if not simulated(scene, exposure_brackets):
-        return exposed(scene, image, frame)
+        return exposed(scene, image, photograph)
     return exposure_brackets.best_exposure(image, scene)
 
 

@@ -34,16 +34,16 @@ def heldout_pairs(scene: Scene) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     Parameters
     ----------
     scene : Scene
-        Gives the rig, how many frames, and the seed.
+        Gives the rig, how many photographs, and the seed.
 
     Returns
     -------
     list of (camera, light)
         In the native capture format, ids ``h000``, ``h001``, ... With a single
-        camera every frame keeps it: only the light is unseen then.
+        camera every photograph keeps it: only the light is unseen then.
     """
     rng = np.random.default_rng((scene.seed, 1))
-    return [_pair(scene, f"h{frame:03d}", rng) for frame in range(scene.heldout_frames)]
+    return [_pair(scene, f"h{index:03d}", rng) for index in range(scene.heldout_photographs)]
 
 
 def _pair(

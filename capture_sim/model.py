@@ -163,11 +163,11 @@ class Scene:
         ``"hull"`` or ``"plane"``, a hint for those who process the capture.
     image : ImageOptions
     effects : EffectOptions
-    heldout_frames : int
+    heldout_photographs : int
         Photographs of unseen views under unseen lights.
     truth : TruthOptions
     seed : int
-        Of noise, held-out frames and truth points.
+        Of noise, held-out photographs and truth points.
     brightness : Brightness
         Of its photographs, for decisions about effects.
     costs : Stopwatch
@@ -185,7 +185,7 @@ class Scene:
     base_geometry: str = "hull"
     image: ImageOptions = field(default_factory=ImageOptions)
     effects: EffectOptions = field(default_factory=EffectOptions)
-    heldout_frames: int = 0
+    heldout_photographs: int = 0
     truth: TruthOptions = field(default_factory=TruthOptions)
     seed: int = 1
     brightness: Brightness = field(default_factory=Brightness)
@@ -203,14 +203,17 @@ class Scene:
                 f"at most {MOST_PHOTOGRAPHS:,} photographs",
                 f"{len(self.cameras)} views x {len(self.lights)} lights",
             )
-        if self.heldout_frames and any(c["model"] != "opencv" for c in self.cameras):
+        if self.heldout_photographs and any(c["model"] != "opencv" for c in self.cameras):
             raise scene_error(
-                "heldout.frames",
+                "heldout.photographs",
                 "0 for cameras other than opencv, which transforms.json cannot describe",
-                self.heldout_frames,
+                self.heldout_photographs,
                 "remove [heldout]",
             )
-        if self.heldout_frames and any(light["type"] == "spot" for light in self.lights):
+        if self.heldout_photographs and any(light["type"] == "spot" for light in self.lights):
             raise scene_error(
-                "heldout.frames", "0 for spot lights", self.heldout_frames, "remove [heldout]"
+                "heldout.photographs",
+                "0 for spot lights",
+                self.heldout_photographs,
+                "remove [heldout]",
             )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from capture_sim.effects import (
     Effect,
-    Frame,
+    Photograph,
     Rig,
     defocus,
     environment,
@@ -55,7 +55,7 @@ class Setup:
     def real(self) -> Scene:
         """The scene with cameras and lights as they are: what is rendered."""
         return replace(
-            self.scene, cameras=self.rig.cameras, lights=self.rig.lights, heldout_frames=0
+            self.scene, cameras=self.rig.cameras, lights=self.rig.lights, heldout_photographs=0
         )
 
     @property
@@ -100,7 +100,7 @@ def photographs(
     lights: NDArray[np.intp],
     view: ViewSamples | None = None,
     traced: TracedLights | None = None,
-) -> Iterator[tuple[Frame, Float32]]:
+) -> Iterator[tuple[Photograph, Float32]]:
     """Photographs of one view, up to the sensor.
 
     Parameters
@@ -120,7 +120,7 @@ def photographs(
 
     Yields
     ------
-    frame : Frame
+    photograph : Photograph
     radiance : (h, w, 3) float32
         Linear, arriving at the pixels.
     """
@@ -128,9 +128,9 @@ def photographs(
     room = _room_light(scene, tracer, view) if simulated(scene, environment) else None
     depth = mean_depth(view) if simulated(scene, defocus) else None
     for light, radiance in _lit_by_lamps(scene, tracer, view, lights, traced):
-        frame = Frame(view.camera, index, light, depth=depth)
+        photograph = Photograph(view.camera, index, light, depth=depth)
         arriving = radiance if room is None else radiance + room
-        yield frame, in_turn(OPTICS_EFFECTS, arriving, scene, frame)
+        yield photograph, in_turn(OPTICS_EFFECTS, arriving, scene, photograph)
 
 
 def _lit_by_lamps(

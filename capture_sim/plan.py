@@ -155,16 +155,17 @@ def plan(scene: Scene, *, max_memory: int | None = None) -> Plan:
         n_points=int(points),
         n_lit=int(points * n_lights * sample_run.lit_fraction),
     )
-    frames = work.n_photographs + scene.heldout_frames
+    n_photographs = work.n_photographs + scene.heldout_photographs
     fixed_bytes = 4 * scene.truth.points * work.n_photographs  # samples, deflated to a third
     fixed_bytes += 32 * len(scene.mesh.vertices) + 13 * len(scene.mesh.faces)  # the mesh
     return Plan(
         scene=scene.name,
         work=work,
         effects=tuple(_planned(effect, scene, work) for effect in EFFECTS),
-        seconds=n_views * sample_run.view_seconds + frames * sample_run.photograph_seconds,
+        seconds=n_views * sample_run.view_seconds
+        + n_photographs * sample_run.photograph_seconds,
         repairs=scene.mesh.notes,
-        bytes=int(n_views * sample_run.view_bytes + frames * sample_run.photograph_bytes)
+        bytes=int(n_views * sample_run.view_bytes + n_photographs * sample_run.photograph_bytes)
         + fixed_bytes,
     )
 

@@ -5,7 +5,7 @@ A scene file holds the tables below; only `object`, `material`, `cameras` and
 
     name = "vase"                    # default: the file's stem
     description = "one line"
-    seed = 1                         # of noise, held-out frames and truth points
+    seed = 1                         # of noise, held-out photographs and truth points
     base_geometry = "hull"           # "plane": a flat sample, first camera facing it
 
     [object]
@@ -23,14 +23,14 @@ A scene file holds the tables below; only `object`, `material`, `cameras` and
 
     [effects]                        # or: effects = "auto"
     simulate = "auto"                # "all", "none", or a list of names
-    tolerance = 1e-3                 # changes below this part of a frame's 99th percentile
+    tolerance = 1e-3                 # changes below this part of a photograph's 99th percentile
     shadows = "off"                  # any effect: "on", "off", "auto"; or its parameters:
     [effects.sensor_noise]
     electrons_per_radiance = 1e5
     read_noise = 2.0                 # electrons
 
     [heldout]
-    frames = 4                       # each with an unseen view and an unseen light
+    photographs = 4                  # each with an unseen view and an unseen light
     [truth]
     per_view = true                  # depth, position, frames, label, visibility
     points = 400                     # surface points with full apparent BRDFs
@@ -188,7 +188,7 @@ def parse_scene(table: Table, *, default_name: str = "scene", folder: Path = Pat
         lights=tuple(make_lights(_required_table(reader, "lights"))),
         image=_image_options(reader.take("image", {})),
         effects=read_effects(reader.take("effects", {})),
-        heldout_frames=_heldout_frames(reader.take("heldout", {})),
+        heldout_photographs=_heldout_photographs(reader.take("heldout", {})),
         truth=_truth_options(reader.take("truth", {})),
     )
     reader.finish()
@@ -232,11 +232,12 @@ def _image_options(table: Table) -> ImageOptions:
     return options
 
 
-def _heldout_frames(table: Table) -> int:
+def _heldout_photographs(table: Table) -> int:
     reader = TableReader("heldout", table)
-    frames = reader.count("frames", 0, low=0, high=4096)
+    reader.accept_renamed("frames", "photographs")
+    photographs = reader.count("photographs", 0, low=0, high=4096)
     reader.finish()
-    return frames
+    return photographs
 
 
 def _truth_options(table: Table) -> TruthOptions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, field, fields
 from pathlib import Path
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from capture_sim.errors import scene_error
 from capture_sim.inputs import check_regular
+
+log = logging.getLogger(__name__)
 
 Table = Mapping[str, Any]
 Options = TypeVar("Options")
@@ -54,6 +57,22 @@ or correct it
         """Take the raw value of `key`, or `default`."""
         self._known.append(key)
         return self._left.pop(key, default)
+
+    def accept_renamed(self, old: str, new: str) -> None:
+        """Read the key `old` as `new`, its present name, with one line of warning.
+
+        A `SceneError` that names both where the table holds both.
+        """
+        if old not in self._left:
+            return
+        if new in self._left:
+            both = f"{self.name(new)}, {self.name(old)}"
+            raise scene_error(both, "one of the two", "both", f"remove {self.name(old)}")
+        log.warning(
+            "%s is now %s; the old name is accepted until version 0.2",
+            *(self.name(old), self.name(new)),
+        )
+        self._left[new] = self._left.pop(old)
 
     def require(self, key: str) -> Any:
         """Take the raw value of `key`; a `SceneError` if it is not there."""

@@ -2,8 +2,8 @@
 
 ``transforms_train.json`` and ``transforms_test.json`` list OpenEXR images of radiance over
 black with the coverage as alpha, one light each (``pl_pos``, ``pl_intensity``), as NRHints and
-GS3 take them. The test split is that of the held-out frames; where the scene has none, it is
-every eighth photograph.
+GS3 take them. The test split is that of the held-out photographs; where the scene has none, it
+is every eighth photograph.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from capture_sim.photograph import Setup
 Table = Mapping[str, Any]
 
 FOLDER = "transforms"
-TEST_STEP = 8  # one photograph of so many is a test where no frame is held out
+TEST_STEP = 8  # one photograph of so many is a test where none is held out
 
 
 class SplitImage(NamedTuple):
@@ -70,7 +70,7 @@ def check_transforms(scene: Scene) -> None:
 
 
 def write_transforms(setup: Setup, folder: Path) -> None:
-    """Write both splits from a capture's photographs, silhouettes and held-out frames.
+    """Write both splits from a capture's photographs, silhouettes and held-out photographs.
 
     Parameters
     ----------

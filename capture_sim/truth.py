@@ -56,7 +56,7 @@ def write_truth(
     folder : Path
         The capture; ``truth/`` is made inside.
     ideal : Scene
-        With cameras and lights as calibrated: held-out frames are free of the rig's
+        With cameras and lights as calibrated: held-out photographs are free of the rig's
         errors, of the lens' and of the sensor's.
     more : dict of str to str
         Further entries of the list of what there is.
@@ -67,7 +67,7 @@ def write_truth(
     write_whole(truth / "mesh.ply", write_ply, scene.mesh)
     if scene.truth.per_view:
         listing["views"] = "truth/views/{camera}.npz"
-    if ideal.heldout_frames:
+    if ideal.heldout_photographs:
         listing["heldout"] = "truth/heldout.json"
         _write_heldout(ideal, tracer, truth)
     if scene.truth.points:

@@ -24,7 +24,7 @@ from capture_sim.destination import (
     publish,
     reserved,
 )
-from capture_sim.effects import Frame, exposure_brackets, simulated
+from capture_sim.effects import Photograph, exposure_brackets, simulated
 from capture_sim.effects.sensor import exposed
 from capture_sim.errors import scene_error
 from capture_sim.files import (
@@ -247,8 +247,8 @@ def _write_view(
     silhouette = folder / _silhouette(camera)
     if len(lights) or not silhouette.is_file():
         view = sample_view(scene, tracer, camera)
-        for frame, radiance in photographs(scene, tracer, index, lights, view, traced):
-            _write_photograph(scene, folder, frame, radiance)
+        for photograph, radiance in photographs(scene, tracer, index, lights, view, traced):
+            _write_photograph(scene, folder, photograph, radiance)
             tally.add_one()
         write_whole(silhouette, write_silhouette, view.coverage)
     if scene.truth.per_view:
@@ -263,15 +263,15 @@ def _files(scene: Scene, camera: Table, light: Table) -> list[str]:
 
 
 def _write_photograph(
-    scene: Scene, folder: Path, frame: Frame, radiance: NDArray[np.float32]
+    scene: Scene, folder: Path, photograph: Photograph, radiance: NDArray[np.float32]
 ) -> None:
-    camera, light = frame.camera, scene.lights[frame.light]
+    camera, light = photograph.camera, scene.lights[photograph.light]
     if not simulated(scene, exposure_brackets):
-        values = exposed(scene, radiance, frame)
+        values = exposed(scene, radiance, photograph)
         write_whole(folder / _photograph(camera["id"], light["id"]), write_exr, values)
         return
     for index, exposure in enumerate(_exposures(scene, camera, light)):
-        bracket = replace(frame, exposure=index, seconds=exposure["seconds"])
+        bracket = replace(photograph, exposure=index, seconds=exposure["seconds"])
         values = exposed(scene, radiance, bracket)
         write_whole(folder / exposure["file"], write_png, exposure_brackets.apply(values))
 

@@ -23,9 +23,9 @@ Stages, in the order in which they act, and what ``apply`` gets and returns ther
                -> (n, 3, n_lights)``: radiance that n surface points send to the camera
                beyond direct light; `views` are unit directions to it, (n, 3), in the
                world, `traced` the visibility of the lights, where it is known
-``OPTICS``     ``apply(radiance, scene, frame) -> radiance``: from the radiance of the
+``OPTICS``     ``apply(radiance, scene, photograph) -> radiance``: from the radiance of the
                scene to what arrives at the pixels, (h, w, 3) float32
-``SENSOR``     ``apply(values, scene, frame) -> values``: from what arrives to what is
+``SENSOR``     ``apply(values, scene, photograph) -> values``: from what arrives to what is
                recorded
 =============  =======================================================================
 
@@ -128,8 +128,8 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """Which photograph optics and sensor act on.
+class Photograph:
+    """The photograph that optics and sensor act on, as one exposure takes it.
 
     Attributes
     ----------
@@ -282,13 +282,16 @@ class ImageEffect(Effect, Protocol):
     """An effect on whole photographs: of the lens or of the sensor's pixels."""
 
     def apply(
-        self, values: NDArray[np.float32], scene: Scene, frame: Frame
+        self, values: NDArray[np.float32], scene: Scene, photograph: Photograph
     ) -> NDArray[np.float32]:
         """Change a photograph."""
 
 
 def in_turn(
-    effects: tuple[ImageEffect, ...], values: NDArray[np.float32], scene: Scene, frame: Frame
+    effects: tuple[ImageEffect, ...],
+    values: NDArray[np.float32],
+    scene: Scene,
+    photograph: Photograph,
 ) -> NDArray[np.float32]:
     """Apply those effects on a photograph that are on, one after the other.
 
@@ -298,7 +301,7 @@ def in_turn(
     values : (h, w, 3) or (h, w) float32
     scene : Scene
         Decides, and keeps the time that each takes.
-    frame : Frame
+    photograph : Photograph
 
     Returns
     -------
@@ -307,5 +310,5 @@ def in_turn(
     for effect in effects:
         if simulated(scene, effect):
             with scene.costs.measure(effect.NAME):
-                values = effect.apply(values, scene, frame)
+                values = effect.apply(values, scene, photograph)
     return values

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Frame, Stage, Workload, sensor_noise
+from capture_sim.effects import Cost, Decision, Photograph, Stage, Workload, sensor_noise
 from capture_sim.model import Scene
 from capture_sim.tables import bounded
 
@@ -56,7 +56,9 @@ def cost(scene: Scene, work: Workload) -> Cost:
     return Cost(operations=work.n_values)
 
 
-def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
+def apply(
+    values: NDArray[np.float32], scene: Scene, photograph: Photograph
+) -> NDArray[np.float32]:
     """Add the true pedestal, cut off what is below zero, subtract the nominal one.
 
     References
@@ -65,6 +67,6 @@ def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np
     """
     options = scene.effects.get(Options)
     channels = values.shape[2:]
-    drift = options.drift * frame.rng(scene, NAME).standard_normal(channels)
+    drift = options.drift * photograph.rng(scene, NAME).standard_normal(channels)
     pedestal = (options.level + drift).astype(np.float32)
     return np.maximum(values + pedestal, np.float32(0.0)) - np.float32(options.level)

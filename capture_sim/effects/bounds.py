@@ -62,7 +62,7 @@ def shift_bound(scene: Scene, pixels: float) -> float:
     Returns
     -------
     float
-        Part of the frame's 99th percentile.
+        Part of the photograph's 99th percentile.
     """
     row = 1.0 / scene.image.samples_per_side if pixels > SMALLEST_SHIFT else 0.0
     return scene.brightness.headroom * min(1.0, float(pixels) + row + RAY_ROUNDING)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Frame, Stage, Workload
+from capture_sim.effects import Cost, Decision, Photograph, Stage, Workload
 from capture_sim.effects.bounds import camera_distances
 from capture_sim.model import Scene, Table
 from capture_sim.tables import bounded
@@ -153,28 +153,28 @@ def disc_kernel(diameter: float) -> Float32:
     return np.asarray(kernel / kernel.sum(), np.float32)
 
 
-def apply(radiance: Float32, scene: Scene, frame: Frame) -> Float32:
+def apply(radiance: Float32, scene: Scene, photograph: Photograph) -> Float32:
     """Blur a photograph by the distance of what each pixel shows.
 
     Raises
     ------
     ValueError
-        If the frame has no depth.
+        If the photograph has no depth.
 
     References
     ----------
     M. Potmesil and I. Chakravarty, "Synthetic image generation with a lens and aperture
     camera model", ACM Transactions on Graphics 1(2), 1982.
     """
-    if frame.depth is None:
-        raise ValueError("frame.depth: expected an image, received None")
-    depth = np.where(frame.depth > 0.0, frame.depth, np.inf).astype(np.float64)
+    if photograph.depth is None:
+        raise ValueError("photograph.depth: expected an image, received None")
+    depth = np.where(photograph.depth > 0.0, photograph.depth, np.inf).astype(np.float64)
     finite = np.isfinite(depth)
     if not finite.any():
         return radiance
     diameter = np.zeros(depth.shape)
     options = scene.effects.get(Options)
-    diameter[finite] = disc_diameter(frame.camera, depth[finite], options, scene)
+    diameter[finite] = disc_diameter(photograph.camera, depth[finite], options, scene)
     return _scattered(radiance, diameter / LAYER)
 
 

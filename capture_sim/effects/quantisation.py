@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Frame, Stage, Workload
+from capture_sim.effects import Cost, Decision, Photograph, Stage, Workload
 from capture_sim.model import Scene
 from capture_sim.tables import bounded
 
@@ -70,9 +70,11 @@ def cost(scene: Scene, work: Workload) -> Cost:
     return Cost(operations=work.n_values)
 
 
-def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
+def apply(
+    values: NDArray[np.float32], scene: Scene, photograph: Photograph
+) -> NDArray[np.float32]:
     """Round to whole steps, at most the largest code."""
-    del frame
+    del photograph
     options = scene.effects.get(Options)
     step = np.float32(options.step)
     return np.minimum(np.rint(values / step), np.float32(options.largest_code)) * step

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Frame, Stage, Workload
+from capture_sim.effects import Cost, Decision, Photograph, Stage, Workload
 from capture_sim.model import Scene
 from capture_sim.tables import bounded
 
@@ -45,7 +45,9 @@ def cost(scene: Scene, work: Workload) -> Cost:
     return Cost(operations=work.n_values)
 
 
-def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
+def apply(
+    values: NDArray[np.float32], scene: Scene, photograph: Photograph
+) -> NDArray[np.float32]:
     """Cut off what is too bright."""
-    del frame
+    del photograph
     return np.minimum(values, np.float32(scene.effects.get(Options).radiance))

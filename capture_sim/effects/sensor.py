@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture_sim.effects import (
-    Frame,
+    Photograph,
     bayer,
     black_level,
     in_turn,
@@ -23,7 +23,7 @@ Float32 = NDArray[np.float32]
 PIXEL_EFFECTS = (sensor_noise, saturation, black_level, quantisation)
 
 
-def exposed(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
+def exposed(scene: Scene, radiance: Float32, photograph: Photograph) -> Float32:
     """Record one exposure.
 
     Parameters
@@ -32,7 +32,7 @@ def exposed(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
         Decides on the effects.
     radiance : (h, w, 3) float32
         Linear, arriving at the pixels.
-    frame : Frame
+    photograph : Photograph
         Which photograph and exposure.
 
     Returns
@@ -40,12 +40,14 @@ def exposed(scene: Scene, radiance: Float32, frame: Frame) -> Float32:
     (h, w, 3) float32
         Linear; radiance times the exposure's seconds, with the sensor's errors.
     """
-    values = radiance if frame.seconds == 1.0 else radiance * np.float32(frame.seconds)
+    values = (
+        radiance if photograph.seconds == 1.0 else radiance * np.float32(photograph.seconds)
+    )
     if not simulated(scene, bayer):
-        return in_turn(PIXEL_EFFECTS, values, scene, frame)
+        return in_turn(PIXEL_EFFECTS, values, scene, photograph)
     with scene.costs.measure(bayer.NAME):
         seen = bayer.mosaic(values)
-    seen = in_turn(PIXEL_EFFECTS, seen, scene, frame)
+    seen = in_turn(PIXEL_EFFECTS, seen, scene, photograph)
     with scene.costs.measure(bayer.NAME):
         return bayer.apply(seen, scene)
 

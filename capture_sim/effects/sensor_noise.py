@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Frame, Stage, Workload
+from capture_sim.effects import Cost, Decision, Photograph, Stage, Workload
 from capture_sim.model import Scene
 from capture_sim.tables import bounded
 
@@ -83,7 +83,9 @@ def standard_deviation(options: Options, radiance: float) -> float:
     return float(np.sqrt(radiance * gain + options.read_noise**2) / gain)
 
 
-def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
+def apply(
+    values: NDArray[np.float32], scene: Scene, photograph: Photograph
+) -> NDArray[np.float32]:
     """Photograph a noise-free image with a real sensor.
 
     References
@@ -91,7 +93,7 @@ def apply(values: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np
     EMVA Standard 1288, "Standard for characterization of image sensors and
     cameras", release 4.0, 2021: shot noise is Poisson, dark noise normal.
     """
-    return with_noise(values, scene.effects.get(Options), frame.rng(scene, NAME))
+    return with_noise(values, scene.effects.get(Options), photograph.rng(scene, NAME))
 
 
 def with_noise(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from capture_sim.effects import Cost, Decision, Frame, Stage, Workload
+from capture_sim.effects import Cost, Decision, Photograph, Stage, Workload
 from capture_sim.effects.bounds import camera_distances
 from capture_sim.model import Scene, Table
 from capture_sim.tables import bounded
@@ -104,7 +104,9 @@ def gain(camera: Table, options: Options) -> NDArray[np.float64]:
     return np.asarray(np.maximum(factor, 0.0))
 
 
-def apply(radiance: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[np.float32]:
+def apply(
+    radiance: NDArray[np.float32], scene: Scene, photograph: Photograph
+) -> NDArray[np.float32]:
     """Darken a photograph towards its corners.
 
     References
@@ -112,5 +114,5 @@ def apply(radiance: NDArray[np.float32], scene: Scene, frame: Frame) -> NDArray[
     D. B. Goldman, "Vignette and exposure calibration and compensation", IEEE
     Transactions on Pattern Analysis and Machine Intelligence 32(12), 2010.
     """
-    factor = gain(frame.camera, scene.effects.get(Options))
+    factor = gain(photograph.camera, scene.effects.get(Options))
     return radiance * factor[..., None].astype(np.float32)

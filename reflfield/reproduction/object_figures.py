@@ -55,7 +55,7 @@ preset = "{rig}"
 target = [0.0, 0.0, 0.1]
 distance = 1.0
 [heldout]
-frames = 4
+photographs = 4
 [truth]
 per_view = false
 points = {points}

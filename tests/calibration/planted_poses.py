@@ -45,7 +45,7 @@ SCENE = {
         "distance": 0.6,
     },
     "image": {"samples_per_side": 1, "edge_samples_per_side": 8},
-    "heldout": {"frames": 0},
+    "heldout": {"photographs": 0},
     "truth": {"per_view": False, "points": 1},
 }
 # Degrees and millimetres.

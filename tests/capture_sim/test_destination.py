@@ -214,7 +214,7 @@ def test_a_kill_while_files_go_to_their_places_is_made_good(
     out = tmp_path / "out"
     out.mkdir()
     if earlier:
-        write_capture(scene(heldout={"frames": 1}, material={"preset": "gold"}), out)
+        write_capture(scene(heldout={"photographs": 1}, material={"preset": "gold"}), out)
     done, replace = [], type(out).replace
 
     def killed(path, target):

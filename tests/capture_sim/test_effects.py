@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture_sim.effects import (
-    Frame,
+    Photograph,
     Workload,
     antialiasing,
     near_lights,
@@ -169,9 +169,13 @@ def test_noise_of_photographs_is_independent_and_repeatable():
     radiance = np.ones((64, 64, 3), np.float32)
     noisy = scene(effects={"sensor_noise": {"electrons_per_radiance": 100, "read_noise": 1}})
     camera = noisy.cameras[0]
-    first = sensor_noise.apply(radiance, noisy, Frame(camera, 0, 0))
-    assert (first == sensor_noise.apply(radiance, noisy, Frame(camera, 0, 0))).all()
-    for frame in (Frame(camera, 0, 1), Frame(camera, 1, 0), Frame(camera, 0, 0, exposure=1)):
-        other = sensor_noise.apply(radiance, noisy, frame)
+    first = sensor_noise.apply(radiance, noisy, Photograph(camera, 0, 0))
+    assert (first == sensor_noise.apply(radiance, noisy, Photograph(camera, 0, 0))).all()
+    for photograph in (
+        Photograph(camera, 0, 1),
+        Photograph(camera, 1, 0),
+        Photograph(camera, 0, 0, exposure=1),
+    ):
+        other = sensor_noise.apply(radiance, noisy, photograph)
         correlation = np.corrcoef(first.ravel(), other.ravel())[0, 1]
         assert abs(correlation) < 4 / np.sqrt(first.size)  # 4 sigma

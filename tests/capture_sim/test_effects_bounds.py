@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture_sim.brightness import frame_scale, measured, relative_change
+from capture_sim.brightness import measured, photograph_scale, relative_change
 from capture_sim.contributions import contributions, some_pairs
 from capture_sim.effects import light_extent, simulated
 from capture_sim.effects.effect_registry import EFFECTS
@@ -132,7 +132,7 @@ def test_the_sensors_own_noise_is_a_tolerance():
 
 def test_scale_and_change_of_photographs():
     image = np.zeros((20, 20, 3))
-    assert frame_scale(image) == 0.0
+    assert photograph_scale(image) == 0.0
     assert relative_change(image, image) == 0.0
     assert relative_change(image, image + 1.0) == np.inf
     image[:10] = 4.0

@@ -6,7 +6,7 @@ import pytest
 from capture_sim.brightness import measured
 from capture_sim.contributions import arriving
 from capture_sim.effects import (
-    Frame,
+    Photograph,
     defocus,
     environment,
     light_extent,
@@ -80,7 +80,7 @@ def test_defocus_keeps_the_light_and_the_plane_of_focus():
     image[24, 20] = 1.0
     for depth, sharp in ((0.8, True), (1.0, False)):
         at = np.full((48, 48), depth, np.float32)
-        blurred = defocus.apply(image, thing, Frame(thing.cameras[0], 0, 0, depth=at))
+        blurred = defocus.apply(image, thing, Photograph(thing.cameras[0], 0, 0, depth=at))
         # Sums of float32 over some hundred pixels.
         np.testing.assert_allclose(blurred.sum(axis=(0, 1)), 1.0, rtol=1e-5)
         assert bool(blurred[24, 20, 0] > 0.99) is sharp
@@ -88,8 +88,10 @@ def test_defocus_keeps_the_light_and_the_plane_of_focus():
 
 def test_defocus_needs_depth():
     thing = scene(defocus={})
-    with pytest.raises(ValueError, match=r"frame\.depth"):
-        defocus.apply(np.zeros((4, 4, 3), np.float32), thing, Frame(thing.cameras[0], 0, 0))
+    with pytest.raises(ValueError, match=r"photograph\.depth"):
+        defocus.apply(
+            np.zeros((4, 4, 3), np.float32), thing, Photograph(thing.cameras[0], 0, 0)
+        )
 
 
 def test_orthographic_cameras_are_always_sharp():

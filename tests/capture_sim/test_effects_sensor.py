@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture_sim.effects import (
-    Frame,
+    Photograph,
     bayer,
     black_level,
     exposure_brackets,
@@ -29,8 +29,8 @@ def scene(**effects):
     )
 
 
-def frame(thing, light=0, **more):
-    return Frame(thing.cameras[0], 0, light, **more)
+def photograph(thing, light=0, **more):
+    return Photograph(thing.cameras[0], 0, light, **more)
 
 
 def malvar_by_hand(seen, row, column):
@@ -72,7 +72,7 @@ def test_demosaicing_keeps_flat_colours_and_what_was_seen(rng, kind):
 def test_quantisation_errs_like_a_uniform_variable(rng):
     thing = scene(quantisation={"bits": 8, "full_scale": 2.0})
     values = rng.random((200, 200)).astype(np.float32)
-    error = quantisation.apply(values, thing, frame(thing)).astype(float) - values
+    error = quantisation.apply(values, thing, photograph(thing)).astype(float) - values
     step = 2.0 / 255
     assert np.abs(error).max() <= step / 2 * (1 + 1e-5)
     assert error.var() == pytest.approx(step**2 / 12, rel=4 * np.sqrt(0.8 / error.size))
@@ -81,11 +81,11 @@ def test_quantisation_errs_like_a_uniform_variable(rng):
 def test_a_digitiser_clips_at_full_scale():
     thing = scene(quantisation={"bits": 2, "full_scale": 3.0})
     values = np.array([-0.6, 0.4, 2.4, 2.6, 3.0, 3.4, 3.6, 1e30, np.inf], np.float32)
-    codes = quantisation.apply(values, thing, frame(thing)).tolist()
+    codes = quantisation.apply(values, thing, photograph(thing)).tolist()
     assert codes == [-1.0, 0.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]
     deep = scene(quantisation={"bits": 24, "full_scale": 1.0})
     # The largest code of 24 bits is the largest odd number of a float32.
-    assert quantisation.apply(np.ones(1, np.float32), deep, frame(deep))[0] == 1.0
+    assert quantisation.apply(np.ones(1, np.float32), deep, photograph(deep))[0] == 1.0
 
 
 def test_clipping_calls_for_the_digitiser():
@@ -108,14 +108,14 @@ def test_clipping_calls_for_the_digitiser():
 def test_full_wells_cut_off():
     thing = scene(saturation={"radiance": 2.0})
     values = np.array([0.5, 2.0, 7.0], np.float32)
-    assert saturation.apply(values, thing, frame(thing)).tolist() == [0.5, 2.0, 2.0]
+    assert saturation.apply(values, thing, photograph(thing)).tolist() == [0.5, 2.0, 2.0]
 
 
 def test_noise_below_the_pedestal_is_cut_off():
     """Half-normal remains: its mean is sigma / sqrt(2 pi)."""
     noise = {"electrons_per_radiance": 100.0, "read_noise": 5.0}
     thing = scene(sensor_noise=noise, black_level={"level": 0.0, "drift": 0.0})
-    dark = exposed(thing, np.zeros((200, 200, 3), np.float32), frame(thing))
+    dark = exposed(thing, np.zeros((200, 200, 3), np.float32), photograph(thing))
     assert dark.min() == 0.0
     spread = 0.05 * np.sqrt(0.5 - 0.5 / np.pi) / np.sqrt(dark.size)
     assert dark.mean(dtype=float) == pytest.approx(0.05 / np.sqrt(2 * np.pi), abs=4 * spread)
@@ -125,7 +125,10 @@ def test_a_pedestal_keeps_noise_and_drifts():
     thing = scene(black_level={"level": 0.1, "drift": 0.01})
     black = np.zeros((2, 2, 3), np.float32)
     offsets = np.stack(
-        [black_level.apply(black, thing, frame(thing, light))[0, 0] for light in range(300)]
+        [
+            black_level.apply(black, thing, photograph(thing, light))[0, 0]
+            for light in range(300)
+        ]
     )
     assert offsets.std() == pytest.approx(0.01, rel=4 / np.sqrt(2 * offsets.size))
     assert abs(offsets.mean()) < 4 * 0.01 / np.sqrt(offsets.size)
@@ -163,7 +166,7 @@ def test_merged_exposures_recover_radiance_within_the_predicted_variance(rng):
     image = np.broadcast_to(radiance[:, None, None], (16, 4000, 3))
     encoded = [
         exposure_brackets.apply(
-            exposed(thing, image, frame(thing, exposure=index, seconds=time))
+            exposed(thing, image, photograph(thing, exposure=index, seconds=time))
         )
         for index, time in enumerate(seconds)
     ]
@@ -207,13 +210,13 @@ def test_effects_that_are_off_are_not_called(monkeypatch, effect):
     monkeypatch.setattr(effect, "apply", fail)
     image = np.ones((4, 4, 3), np.float32)
     thing = scene(sensor_noise={})
-    assert exposed(thing, image, frame(thing)).shape == (4, 4, 3)
+    assert exposed(thing, image, photograph(thing)).shape == (4, 4, 3)
     on = scene(**{effect.NAME: {}})
     with pytest.raises(AssertionError, match=effect.NAME):
-        exposed(on, image, frame(on))
+        exposed(on, image, photograph(on))
 
 
 def test_a_sensor_without_effects_returns_what_arrives():
     image = np.ones((4, 4, 3), np.float32)
     plain = scene()
-    assert exposed(plain, image, frame(plain)) is image
+    assert exposed(plain, image, photograph(plain)) is image

@@ -69,7 +69,7 @@ SCENE = {
         "sensor_noise": {"electrons_per_radiance": 1e4, "read_noise": 2.0},
         "quantisation": {"bits": 10, "full_scale": 4.0},
     },
-    "heldout": {"frames": 1},
+    "heldout": {"photographs": 1},
     "truth": {"per_view": False, "points": 5},
 }
 

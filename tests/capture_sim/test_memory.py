@@ -42,7 +42,7 @@ def scene(*more, material=None, effects=None, **changed):
             },
             "lights": {"preset": "fibonacci", "n": 5},
             "effects": {**EFFECTS, **(effects or {}), "simulate": simulate},
-            "heldout": {"frames": 1},
+            "heldout": {"photographs": 1},
             "truth": {"points": 10},
             **changed,
         }

@@ -1,8 +1,11 @@
 """Scene files: what is accepted, and how mistakes are reported."""
 
+import logging
+
 import numpy as np
 import pytest
 
+from capture_sim import cli
 from capture_sim.errors import SceneError
 from capture_sim.scene import find_scene, load_scene, parse_scene, shipped_scenes
 
@@ -19,7 +22,7 @@ def tables(**changed):
 
 def test_defaults():
     scene = parse_scene(tables(), default_name="ball")
-    assert (scene.name, scene.base_geometry, scene.heldout_frames) == ("ball", "hull", 0)
+    assert (scene.name, scene.base_geometry, scene.heldout_photographs) == ("ball", "hull", 0)
     assert (scene.image.samples_per_side, scene.image.edge_samples_per_side) == (2, 4)
     assert (scene.effects.simulate, scene.effects.tolerance) == ("auto", 1e-3)
     assert scene.effects.parameters == ()
@@ -62,7 +65,7 @@ def test_defaults():
             {"effects": {"exposure_brackets": {"seconds": 1.0}}},
             r"exposure_brackets\.seconds: expected a list",
         ),
-        ({"heldout": {"frames": -2}}, r"heldout\.frames"),
+        ({"heldout": {"photographs": -2}}, r"heldout\.photographs"),
         ({"truth": {"per_view": 1}}, r"truth\.per_view: expected true or false"),
     ],
 )
@@ -79,10 +82,47 @@ def test_missing_tables_are_named(key):
         parse_scene(incomplete)
 
 
-def test_heldout_frames_need_a_perspective_camera():
+def test_heldout_photographs_need_a_perspective_camera():
     orthographic = {"preset": "rti", "model": "orthographic"}
-    with pytest.raises(SceneError, match=r"heldout\.frames: expected 0 for cameras other"):
-        parse_scene(tables(cameras=orthographic, heldout={"frames": 1}))
+    with pytest.raises(SceneError, match=r"heldout\.photographs: expected 0 for cameras other"):
+        parse_scene(tables(cameras=orthographic, heldout={"photographs": 1}))
+
+
+class TestRenamedKey:
+    """Scenes of earlier versions call the held-out photographs `frames`."""
+
+    def test_the_old_name_is_read_with_one_line(self, caplog):
+        with caplog.at_level(logging.WARNING, logger="capture_sim"):
+            scene = parse_scene(tables(heldout={"frames": 3}))
+        assert scene.heldout_photographs == 3
+        (record,) = caplog.records
+        assert record.getMessage() == (
+            "heldout.frames is now heldout.photographs; the old name is accepted until "
+            "version 0.2"
+        )
+
+    def test_the_new_name_is_read_without_a_word(self, caplog):
+        with caplog.at_level(logging.WARNING, logger="capture_sim"):
+            scene = parse_scene(tables(heldout={"photographs": 3}))
+        assert (scene.heldout_photographs, caplog.records) == (3, [])
+
+    def test_both_names_are_refused(self):
+        with pytest.raises(
+            SceneError,
+            match=r"heldout\.photographs, heldout\.frames: expected one of the two, received "
+            r"both; remove heldout\.frames$",
+        ):
+            parse_scene(tables(heldout={"photographs": 3, "frames": 3}))
+
+    def test_the_command_says_it_on_one_line(self, monkeypatch, capsys):
+        def warn():
+            parse_scene(tables(heldout={"frames": 3}))
+
+        monkeypatch.setattr(cli, "app", warn)
+        cli.main()
+        error = capsys.readouterr().err.splitlines()
+        assert len(error) == 1
+        assert error[0].startswith("capture-sim: note: heldout.frames is now")
 
 
 def test_textures_need_coordinates(tmp_path):

@@ -66,7 +66,7 @@ def test_a_loader_of_the_others_gets_what_it_asks_for(both):
 
 
 def test_without_held_out_frames_every_eighth_photograph_is_a_test(tmp_path):
-    write_capture(scene(heldout={"frames": 0}), tmp_path / "tiny", as_transforms=True)
+    write_capture(scene(heldout={"photographs": 0}), tmp_path / "tiny", as_transforms=True)
     names = {
         split: [
             frame["file_path"]

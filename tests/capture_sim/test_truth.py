@@ -25,7 +25,7 @@ def scene(thing=None, **changed):
         },
         "lights": {"preset": "fibonacci", "n": 11, "distance": 0.7},
         "truth": {"points": 400},
-        "heldout": {"frames": 6},
+        "heldout": {"photographs": 6},
         **changed,
     }
     return parse_scene(tables)
@@ -172,7 +172,7 @@ def test_heldout_views_and_lights_are_new_but_within_the_rig():
 def test_heldout_lights_stand_on_the_side_of_the_viewer():
     towards = [
         (world_from_camera(camera)[:3, 3], np.array(light["position"]))
-        for camera, light in heldout_pairs(scene(heldout={"frames": 20}))
+        for camera, light in heldout_pairs(scene(heldout={"photographs": 20}))
     ]
     cosines = [v @ l / np.linalg.norm(v) / np.linalg.norm(l) for v, l in towards]  # noqa: E741
     # The nearest light of the mixture does; its neighbours may lie a little behind.

@@ -38,7 +38,7 @@ def scene(**changed):
             },
             "lights": {"preset": "fibonacci", "n": 3},
             "effects": {"sensor_noise": {"electrons_per_radiance": 1e4, "read_noise": 1.0}},
-            "heldout": {"frames": 2},
+            "heldout": {"photographs": 2},
             "truth": {"points": 20},
             **changed,
         }
@@ -135,11 +135,13 @@ def test_mesh_file_opens_elsewhere(tmp_path):
 
 
 def test_an_earlier_capture_is_replaced_only_on_request(tmp_path):
-    small = scene(heldout={"frames": 0}, truth={"points": 0, "per_view": False})
+    small = scene(heldout={"photographs": 0}, truth={"points": 0, "per_view": False})
     target = write_capture(small, tmp_path / "capture")
     with pytest.raises(SceneError, match=r"capture: .*pass --overwrite to replace it"):
         write_capture(small, target)
-    write_capture(scene(heldout={"frames": 1}, truth={"points": 0}), target, overwrite=True)
+    write_capture(
+        scene(heldout={"photographs": 1}, truth={"points": 0}), target, overwrite=True
+    )
     assert (target / "truth" / "heldout.json").is_file()
     write_capture(small, target, overwrite=True)
     assert not (target / "truth" / "views").exists()
@@ -264,7 +266,7 @@ def test_the_reader_reads_the_writer(capture):
 def test_bracketed_exposures_merge_to_the_linear_photograph(tmp_path):
     from reflfield.capture.readers import open_capture
 
-    plain = {"heldout": {"frames": 0}, "truth": {"points": 0, "per_view": False}}
+    plain = {"heldout": {"photographs": 0}, "truth": {"points": 0, "per_view": False}}
     linear = write_capture(scene(effects={}, **plain), tmp_path / "linear")
     times = {"exposure_brackets": {"seconds": [0.02, 0.2, 2.0]}}
     bracketed = write_capture(scene(effects=times, **plain), tmp_path / "bracketed")
@@ -288,7 +290,7 @@ def erring(tmp_path_factory):
         "quantisation": {"bits": 6},
     }
     folder = tmp_path_factory.mktemp("captures") / "erring"
-    plain = {"heldout": {"frames": 1}, "truth": {"points": 0, "per_view": False}}
+    plain = {"heldout": {"photographs": 1}, "truth": {"points": 0, "per_view": False}}
     return write_capture(scene(effects=tables, **plain), folder, n_contributions=2)
 
 
@@ -339,7 +341,7 @@ def test_the_real_rig_is_kept_beside_the_reported_one(erring, capture):
     assert not (capture / "truth" / "rig.json").exists()
 
 
-def test_held_out_frames_are_free_of_errors(erring, capture):
+def test_held_out_photographs_are_free_of_errors(erring, capture):
     ours = read_exr(erring / "truth" / "heldout" / "h000.exr")
     np.testing.assert_array_equal(ours, read_exr(capture / "truth" / "heldout" / "h000.exr"))
 
@@ -349,7 +351,7 @@ def test_calibrated_distortion_reaches_the_reader(tmp_path):
 
     bent = scene(
         effects={"lens_distortion": {"k1": -0.3, "k2": 0.1, "p1": 1e-3}},
-        heldout={"frames": 0},
+        heldout={"photographs": 0},
         truth={"points": 0},
     )
     folder = write_capture(bent, tmp_path / "bent")

@@ -33,7 +33,7 @@ SCENE = {
         "distance": 0.6,
     },
     "image": {"samples_per_side": 1, "edge_samples_per_side": 4},
-    "heldout": {"frames": 0},
+    "heldout": {"photographs": 0},
     "truth": {"per_view": False, "points": 1},
 }
 

@@ -23,7 +23,7 @@ from tests.tiny_dome import ball_scene
 collect_ignore = ["counted.py"]
 
 # A satin ball under 6 lights.
-SCENE = ball_scene("tiny", heldout={"frames": 2}, truth={"points": 20})
+SCENE = ball_scene("tiny", heldout={"photographs": 2}, truth={"points": 20})
 OPTIONS = """
 [hull]
 resolution = 32

@@ -27,7 +27,7 @@ elevations_deg = [10, 60]
 counts = [4, 2]
 distance = 0.6
 [heldout]
-frames = 2
+photographs = 2
 [truth]
 points = 20
 """

@@ -21,7 +21,7 @@ ALBEDO = 0.6
 BALL = copy.deepcopy(SCENE) | {
     "name": "matt ball",
     "material": {"type": "lambert", "albedo": ALBEDO},
-    "heldout": {"frames": 0},
+    "heldout": {"photographs": 0},
     "truth": {"points": 0, "per_view": False},
 }
 BALL["cameras"] |= {"elevations_deg": [10, 35, 65], "counts": [4, 4, 2]}

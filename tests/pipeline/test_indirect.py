@@ -36,7 +36,7 @@ AMPHORA = {
         "target": [0, 0, 0.1],
     },
     "image": {"samples_per_side": 2, "edge_samples_per_side": 2},
-    "heldout": {"frames": 4},
+    "heldout": {"photographs": 4},
     "truth": {"points": 0, "per_view": False},
 }
 
@@ -78,7 +78,7 @@ RING = copy.deepcopy(AMPHORA) | {
     "name": "ring",
     "object": {"type": "mesh", "file": "ring.obj"},
     "material": {"type": "lambert", "albedo": [0.85, 0.5, 0.2]},
-    "heldout": {"frames": 0},
+    "heldout": {"photographs": 0},
 }
 RING["cameras"] |= {
     "elevations_deg": [-25, 0, 25, 60], "counts": [4, 6, 5, 2], "offsets_deg": [0, 0, 20, 0],
