@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import SATURATED, with_bounded_black
 from reflfield.capture.lights import Light
-from reflfield.errors import InputError
+from reflfield.observations.bilinear_sampling import Kinds, mark_kinds, sample_bilinear
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
     UNIT,
@@ -29,7 +28,6 @@ from reflfield.util.blocks import Blocks
 from reflfield.util.validation import check_shape
 
 Floats = NDArray[np.float32]
-Kinds = NDArray[np.uint8]
 # What a value of a photograph at a texel may be. As `capture.clipping` has it: measured; at the
 # upper limit of sensor or file; at code 0; under alpha 0. And of a colour that the light has
 # not; where it gives nothing.
@@ -39,9 +37,6 @@ NOT_MEASURED = ("saturated", "transparent", "dark")
 # Those that do: black is less than the file can say.
 IS_KNOWN = np.array([kind in ("measured", "black") for kind in VALUE_KINDS])
 IS_GAP = np.array([kind in NOT_MEASURED for kind in VALUE_KINDS])
-# A pixel of less weight in a bilinear sample changes it by less than a half float's rounding
-# of eleven bits: what such a pixel is does not matter.
-LEAST_WEIGHT = 2.0**-11
 # Photographs, and texels of each, that the unit of the samples follows from, and the median
 # sample of ordinary captures: a grey of a tenth.
 PHOTOGRAPHS_FOR_UNIT, TEXELS_FOR_UNIT = 16, 1024
@@ -52,66 +47,6 @@ HALF_MAX = 65504.0
 BUDGET = 256 << 20
 # Lights sampled together: the pixel positions are worked out once for all of them.
 LIGHTS_AT_ONCE = 32
-
-
-@numba.njit(cache=True, nogil=True)
-def _sample_bilinear(images: Floats, pixels: NDArray[np.float64], out: Floats) -> None:
-    n_images, height, width, _ = images.shape
-    for i in range(len(pixels)):
-        # Pixel centres lie at half-integers; samples beyond the rim read the rim.
-        x = min(max(pixels[i, 0] - 0.5, 0.0), width - 1.0)
-        y = min(max(pixels[i, 1] - 0.5, 0.0), height - 1.0)
-        column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
-        s, t = np.float32(x - column), np.float32(y - row)
-        right, below = min(column + 1, width - 1), min(row + 1, height - 1)
-        for j in range(n_images):
-            for c in range(3):
-                upper = (1 - s) * images[j, row, column, c] + s * images[j, row, right, c]
-                lower = (1 - s) * images[j, below, column, c] + s * images[j, below, right, c]
-                out[i, j, c] = (1 - t) * upper + t * lower
-
-
-def sample_bilinear(images: Floats, pixels: NDArray[np.float64]) -> Floats:
-    """Values of images at pixel positions.
-
-    Parameters
-    ----------
-    images : (n_images, h, w, 3) float32
-        Linear radiance.
-    pixels : (n, 2) float64
-        x and y; the centre of the top-left pixel is (0.5, 0.5). Beyond the image, the rim.
-
-    Returns
-    -------
-    (n, n_images, 3) float32
-
-    Raises
-    ------
-    ShapeError
-        If a shape is wrong.
-    InputError
-        If a pixel is NaN: the camera does not image that point.
-
-    Examples
-    --------
-    >>> ramp = np.zeros((1, 1, 3, 3), np.float32)
-    >>> ramp[0, 0] = [[0.0], [1.0], [2.0]]
-    >>> float(sample_bilinear(ramp, np.array([[1.25, 0.5]]))[0, 0, 0])
-    0.75
-    """
-    check_shape("images", images, (None, None, None, 3))
-    check_shape("pixels", pixels, (None, 2))
-    absent = np.isnan(pixels).any(axis=1)
-    if absent.any():
-        raise InputError(
-            f"pixels: expected numbers, received NaN in row {int(absent.argmax())}; "
-            "leave out points that the camera does not image"
-        )
-    out = np.zeros((len(pixels), len(images), 3), np.float32)
-    _sample_bilinear(
-        np.ascontiguousarray(images, np.float32), np.ascontiguousarray(pixels, np.float64), out
-    )
-    return out
 
 
 def facing_irradiance(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> Floats:
@@ -443,7 +378,7 @@ def _samples_at(
         image, of_pixels = capture.read_kinds(int(index))
         if of_pixels.any():
             image = with_bounded_black(image, of_pixels)
-            _mark_kinds(of_pixels, pixels, LEAST_WEIGHT, kinds[:, j])
+            mark_kinds(of_pixels, pixels, kinds[:, j])
         images[j] = image
     peaks = images.max(axis=(1, 2, 3))
     irradiance = facing_irradiance(tuple(capture.lights[i] for i in lights), points)
@@ -462,27 +397,6 @@ def _samples_at(
             gaps &= kinds != SATURATED
         values[gaps] = np.nan
     return values, kinds, peaks
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark_kinds(
-    kinds: Kinds, pixels: NDArray[np.float64], least_weight: float, out: Kinds
-) -> None:
-    """Kind (n, 3) of each sampled value: that of its heaviest pixel that is no measurement."""
-    height, width, _ = kinds.shape
-    for i in range(len(pixels)):
-        x = min(max(pixels[i, 0] - 0.5, 0.0), width - 1.0)
-        y = min(max(pixels[i, 1] - 0.5, 0.0), height - 1.0)
-        column, row = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
-        s, t = x - column, y - row
-        for c in range(3):
-            most = least_weight
-            for corner in range(4):
-                right, below = corner & 1, corner >> 1
-                weight = (s if right else 1 - s) * (t if below else 1 - t)
-                kind = kinds[min(row + below, height - 1), min(column + right, width - 1), c]
-                if kind != 0 and weight > most:
-                    most, out[i, c] = weight, kind
 
 
 def directions_of(

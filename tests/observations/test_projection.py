@@ -11,6 +11,7 @@ from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError, ShapeError
 from reflfield.observations import store
+from reflfield.observations.bilinear_sampling import sample_bilinear
 from reflfield.observations.image_projection import (
     HALF_MAX,
     USUAL_SAMPLE,
@@ -20,7 +21,6 @@ from reflfield.observations.image_projection import (
     look_into,
     project_chunk,
     project_photographs,
-    sample_bilinear,
 )
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import ObservationStore, Observed
