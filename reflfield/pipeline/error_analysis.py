@@ -53,10 +53,13 @@ class Analyser:
 
 def write_error_analysis(context: Context, folder: Path) -> dict[str, Any]:
     """Measure the baselines, find where the error lies, and write ``metrics.json``."""
-    analyser, analysed, n_images = analyser_of(context), {}, 0
+    analysed, n_images = {}, 0
+    analyser: Analyser | None = None
     for name, pairs in comparison.relit_pairs(context).items():
         compared = comparison.comparison_of(context, name)
         if compared is not None:
+            # Where nothing was compared the baselines, of all texels, are not needed.
+            analyser = analyser or analyser_of(context)
             (folder / name).mkdir()
             analysed[name] = analyse(analyser, pairs, compared, folder / name)
             (folder / f"{name}.json").write_text(json.dumps(analysed[name], indent=2))
