@@ -31,7 +31,7 @@ FLAGS = {
     "stages": "--stages",
     "tradeoff": "--tradeoff",
     "psnr": "--psnr",
-    "n_frames": "--orbit",
+    "n_images": "--orbit",
     "elevation_deg": "--elevation",
     "environment": "--environment",
     "convention": "--convention",

@@ -220,6 +220,28 @@ class TestField:
             rf.open_field(tmp_path / "field.rfld", max_memory=10)
 
 
+class TestRenamedArgument:
+    """`n_frames` of a turntable is `n_images` now."""
+
+    def test_the_old_name_is_accepted_with_one_line(self, square, tmp_path, caplog):
+        with caplog.at_level(logging.WARNING, "reflfield"):
+            rf.render_turntable(square, tmp_path / "out", light="0,0,1", n_frames=2, size=8)
+        names = sorted(path.name for path in (tmp_path / "out").glob("orbit_*.png"))
+        assert names == ["orbit_000.png", "orbit_001.png"]
+        assert [record.getMessage() for record in caplog.records] == [
+            "argument 'n_frames' is now 'n_images'; the old name is accepted until version 0.2"
+        ]
+
+    def test_both_names_are_refused(self, square, tmp_path):
+        with pytest.raises(
+            rf.InputError,
+            match=r"^n_images, n_frames: expected one of the two, received both; leave out "
+            r"`n_frames`",
+        ):
+            rf.render_turntable(square, tmp_path / "out", light="0,0,1", n_images=2, n_frames=2)
+        assert not (tmp_path / "out").exists()
+
+
 class TestOptions:
     def test_a_renamed_one_is_accepted_with_one_line(self, monkeypatch, caplog):
         monkeypatch.setitem(

@@ -21,6 +21,7 @@ from reflfield.render.environment_map import EnvironmentMap
 from reflfield.render.renderer import RenderOptions
 from reflfield.render.turntable import OrbitOptions, render_orbit
 from reflfield.util.files import filling
+from reflfield.util.renamed_arguments import accepts_old_names
 from reflfield.util.validation import unit_direction
 
 AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
@@ -104,6 +105,7 @@ def compare(
     return write_comparison_with(field.stored, capture, Path(out), fitting, field_photographs)
 
 
+@accepts_old_names(n_frames="n_images")
 def render_turntable(
     field: Field,
     out: Path | str,
@@ -113,7 +115,7 @@ def render_turntable(
     environment_up: ArrayLike | None = None,
     environment_rotation: float | None = None,
     light: ArrayLike | None = None,
-    n_frames: int = 36,
+    n_images: int = 36,
     size: int = 400,
     elevation_deg: float = 20.0,
     options: RenderOptions | None = None,
@@ -137,7 +139,7 @@ def render_turntable(
         Rotation of the map about its zenith, degrees, counter-clockwise seen from above.
     light : (3,) array_like or str, optional
         World direction to a distant light, instead of a map.
-    n_frames : int
+    n_images : int
         Images on the full circle.
     size : int
         Side of an image, pixels.
@@ -160,14 +162,14 @@ def render_turntable(
     _check_lighting(environment, light, (convention, environment_up, environment_rotation))
     stored = field.stored
     x, y, z = stored.up.tolist()
-    orbit = OrbitOptions(n_frames, (x, y, z), elevation_deg, size=size)
+    orbit = OrbitOptions(n_images, (x, y, z), elevation_deg, size=size)
     width, height = (0, 0) if environment is None else image_size(environment)
     fitting = check_image_memory(
         stored,
         resources or Resources(),
         options or RenderOptions(),
         pixels=size**2,
-        kept_pixels=n_frames * size**2,
+        kept_pixels=n_images * size**2,
         map_pixels=width * height,
     )
     source: Light | EnvironmentMap

@@ -92,7 +92,7 @@ def relight(
         if capture is not None:
             made = relit_capture(opened, capture, out, format, follow_links, made_with)
         else:
-            asked: dict[str, Any] = of_orbit | of_map | {"n_frames": orbit}
+            asked: dict[str, Any] = of_orbit | of_map | {"n_images": orbit}
             stated = {name: value for name, value in asked.items() if value is not None}
             made = turntable(opened, out, stated | made_with)
     for path in made:

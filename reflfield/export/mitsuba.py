@@ -62,7 +62,7 @@ def write_mitsuba(path: Path, field: ReflectanceField) -> list[str]:
             f"one of model {field.model!r} with {field.n_texels}; make one with "
             "`--set compression.model=half_vector`, or export it `--to gltf`"
         )
-    options = OrbitOptions(n_frames=1, up=tuple(field.up))
+    options = OrbitOptions(n_images=1, up=tuple(field.up))
     camera = orbit_cameras(field.positions, options)[0]
     centre = 0.5 * (field.positions.min(axis=0) + field.positions.max(axis=0))
     offset = camera.centre - centre

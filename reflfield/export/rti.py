@@ -163,7 +163,7 @@ def _usual_view(surface: FieldSurface) -> Doubles:
     if np.linalg.norm(mean) > _FLAT:
         return unit_direction("view", mean)
     x, y, z = surface.field.up.tolist()
-    return -orbit_cameras(mesh.vertices, OrbitOptions(n_frames=1, up=(x, y, z)))[0].forward
+    return -orbit_cameras(mesh.vertices, OrbitOptions(n_images=1, up=(x, y, z)))[0].forward
 
 
 def _images(field: ReflectanceField, camera: Camera) -> tuple[Floats, float]:

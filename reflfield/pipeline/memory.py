@@ -174,8 +174,8 @@ IMAGE_BYTES = 64
 # A pixel of a photograph beside it: as stored, linear, what of it is measured; the image
 # read again, silhouette and masks.
 COMPARED_BYTES = 24
-# A pixel of a turntable's frame, all of which are kept: half floats, encoded, animated.
-FRAME_BYTES = 13
+# A pixel of a turntable's image, all of which are kept: half floats, encoded, animated.
+TURNTABLE_BYTES = 13
 # A pixel of an environment map while it is read.
 MAP_BYTES = 28
 # Texel of a field that is rendered, besides its components: frame, point, normal, owner.
@@ -215,7 +215,7 @@ def check_image_memory(
     texel_bytes : int
         Of each texel, besides what rendering takes.
     kept_pixels : int
-        Of all frames of a turntable.
+        Of all images of a turntable.
     map_pixels : int
         Of the largest environment map.
 
@@ -231,7 +231,7 @@ def check_image_memory(
     """
     fitting = within_memory(options, resources)
     blocks = fitting.workers * fitting.block_pixels * RAY_BYTES * options.samples_per_pixel
-    images = pixels * pixel_bytes + kept_pixels * FRAME_BYTES
+    images = pixels * pixel_bytes + kept_pixels * TURNTABLE_BYTES
     directions = options.environment_directions if map_pixels else 0
     least = BASE_BYTES + field_bytes(field, directions) + map_pixels * MAP_BYTES
     least += blocks + images + texel_bytes * field.n_texels

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 # Least and most of each number.
 RANGES: dict[str, tuple[float, float]] = {
-    "n_frames": (1, 3600),
+    "n_images": (1, 3600),
     "size": (1, 16383),
     "elevation_deg": (-89, 89),
     "field_of_view_deg": (1, 150),
@@ -40,7 +40,7 @@ class OrbitOptions:
 
     Parameters
     ----------
-    n_frames : int
+    n_images : int
         Cameras on the full circle, 1 to 3600.
     up : (3,) tuple of float
         Axis of the turntable, world.
@@ -50,7 +50,7 @@ class OrbitOptions:
     field_of_view_deg : float
         Angle of view, degrees; the distance follows, so that the bounding sphere fits.
     size : int
-        Width and height of a frame, pixels, 1 to 16383 (the largest of WebP).
+        Width and height of an image, pixels, 1 to 16383 (the largest of WebP).
     frames_per_second : float
         Speed of the animation, 0.1 to 1000.
     exposure : float, optional
@@ -62,7 +62,7 @@ class OrbitOptions:
         If a number is out of range.
     """
 
-    n_frames: int = 36
+    n_images: int = 36
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     elevation_deg: float = 20.0
     field_of_view_deg: float = 30.0
@@ -85,17 +85,17 @@ class Orbit:
 
     Parameters
     ----------
-    frames : tuple of Path
+    images : tuple of Path
         PNG of each camera.
     animation : Path
         Animated WebP.
     contact_sheet : Path
-        PNG with all frames side by side.
+        PNG with all images side by side.
     exposure : float
         Factor before the sRGB encoding.
     """
 
-    frames: tuple[Path, ...]
+    images: tuple[Path, ...]
     animation: Path
     contact_sheet: Path
     exposure: float
@@ -120,7 +120,7 @@ def orbit_cameras(positions: ArrayLike, options: OrbitOptions | None = None) -> 
     Examples
     --------
     >>> corners = np.array([[-1, -1, -1], [1, 1, 1]])
-    >>> cameras = orbit_cameras(corners, OrbitOptions(n_frames=4, elevation_deg=0))
+    >>> cameras = orbit_cameras(corners, OrbitOptions(n_images=4, elevation_deg=0))
     >>> [camera.centre.round(2).tolist() for camera in cameras[:2]]
     [[6.69, 0.0, 0.0], [0.0, 6.69, 0.0]]
     """
@@ -154,7 +154,7 @@ def render_orbit(
     orbit: OrbitOptions | None = None,
     options: RenderOptions | None = None,
 ) -> Orbit:
-    """Render a turntable and write its frames, animation and contact sheet.
+    """Render a turntable and write its images, animation and contact sheet.
 
     Parameters
     ----------
@@ -188,16 +188,16 @@ def render_orbit(
     for camera in track(cameras, len(cameras), "turntable"):
         rendering = renderer.render(camera, lights)
         meter.add(rendering.image, rendering.coverage)
-        # Half floats: a turntable of 100 frames of 400 pixels stays under 100 MB.
+        # Half floats: a turntable of 100 images of 400 pixels stays under 100 MB.
         images.append(np.minimum(rendering.image, 65504.0).astype(np.float16))
     exposure = meter.exposure_or_one if orbit.exposure is None else orbit.exposure
     pictures = [encoded_picture(image, exposure) for image in images]
-    frames = [folder / f"orbit_{i:03d}.png" for i in range(len(pictures))]
-    for path, picture in zip(frames, pictures, strict=True):
+    files = [folder / f"orbit_{i:03d}.png" for i in range(len(pictures))]
+    for path, picture in zip(files, pictures, strict=True):
         write_png(path, picture)
     write_animation(folder / "orbit.webp", pictures, orbit.frames_per_second)
     write_png(folder / "contact_sheet.png", contact_sheet(pictures))
-    return Orbit(tuple(frames), folder / "orbit.webp", folder / "contact_sheet.png", exposure)
+    return Orbit(tuple(files), folder / "orbit.webp", folder / "contact_sheet.png", exposure)
 
 
 def write_animation(
@@ -210,7 +210,7 @@ def write_animation(
     path : Path or str
         Target; replaced only when the new file is complete.
     pictures : sequence of (h, w, 3) uint8
-        Frames.
+        Images of one size.
     frames_per_second : float
         Speed.
     """
@@ -268,7 +268,7 @@ def _circle(options: OrbitOptions) -> list[Array]:
     ahead /= np.linalg.norm(ahead)
     left = np.cross(up, ahead)
     elevation = math.radians(options.elevation_deg)
-    turns = 2 * np.pi * np.arange(options.n_frames) / options.n_frames
+    turns = 2 * np.pi * np.arange(options.n_images) / options.n_images
     return [
         math.cos(elevation) * (math.cos(turn) * ahead + math.sin(turn) * left)
         + math.sin(elevation) * up

@@ -56,7 +56,7 @@ def fetches(stored):
 
 def difference(page, field):
     """Relative L2 difference from the library over pixels off the rim, and its median."""
-    options = OrbitOptions(n_frames=3, size=COMPARED_SIDE, up=tuple(field.up))
+    options = OrbitOptions(n_images=3, size=COMPARED_SIDE, up=tuple(field.up))
     rows = []
     for camera in orbit_cameras(field.stored.positions, options):
         light = rf.DirectionalLight(camera.up + 0.5 * np.cross(camera.up, camera.forward))

@@ -66,7 +66,7 @@ def test_a_bright_pixel_lights_the_side_it_should(convention):
         assert lights.directions[0] @ axis > np.cos(0.0695)
         field = baked_field(sphere_surface(16), lambert(1.0))
         renderer = Renderer(field, RenderOptions(workers=1, samples_per_pixel=1))
-        (camera,) = orbit_cameras(field.positions, OrbitOptions(n_frames=1, size=1, up=axis))
+        (camera,) = orbit_cameras(field.positions, OrbitOptions(n_images=1, size=1, up=axis))
         sources = renderer._sources(sky)
         values = sources[0].radiance(camera, np.arange(field.n_texels, dtype=np.int32))[:, 0]
         brightest = field.local_from_world[np.argmax(values), 2]
@@ -258,7 +258,7 @@ def test_white_furnace(visibility):
         visibility=visibility,
     )  # fmt: skip
     sky = EnvironmentMap(np.full((32, 64, 3), 2.0, np.float32))
-    (camera,) = orbit_cameras(field.positions, OrbitOptions(n_frames=1, size=32))
+    (camera,) = orbit_cameras(field.positions, OrbitOptions(n_images=1, size=32))
     rendering = render(field, camera, sky, RenderOptions(workers=2, samples_per_pixel=4))
     inside = rendering.coverage == 1
     share = rendering.image[inside] / (2.0 * albedo)
@@ -291,7 +291,7 @@ def test_map_equals_its_lights_one_by_one(rng):
 def test_traced_shadows_do_not_depend_on_order(rng):
     field = baked_field(sphere_surface(12), lambert(0.7), visibility="factored", light_side=5)
     sky, options = random_map(rng, 8), RenderOptions(workers=2, environment_directions=30)
-    cameras = orbit_cameras(field.positions, OrbitOptions(n_frames=3, size=24))
+    cameras = orbit_cameras(field.positions, OrbitOptions(n_images=3, size=24))
     forward, backward = Renderer(field, options), Renderer(field, options)
     pictures = [forward.render(camera, sky).image for camera in cameras]
     again = [backward.render(camera, sky).image for camera in reversed(cameras)]
@@ -305,7 +305,7 @@ def test_light_of_a_capture_names_its_map(tmp_path):
     write_exr(tmp_path / "sky.exr", radiance)
     light = Light("sky", "environment", file=tmp_path / "sky.exr", convention="blender")
     field = baked_field(sphere_surface(8), lambert(1.0))
-    (camera,) = orbit_cameras(field.positions, OrbitOptions(n_frames=1, size=24))
+    (camera,) = orbit_cameras(field.positions, OrbitOptions(n_images=1, size=24))
     image = render(field, camera, light, RenderOptions(workers=1)).image
     assert image[:10].sum() > 3 * image[14:].sum()
 

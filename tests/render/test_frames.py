@@ -26,7 +26,7 @@ def field():
 
 
 def frames_of(field, names=("a", "b.1", "c")):
-    cameras = tuple(orbit_cameras(field.positions, OrbitOptions(n_frames=2, size=24)))
+    cameras = tuple(orbit_cameras(field.positions, OrbitOptions(n_images=2, size=24)))
     lights = tuple(
         Light(f"l{i}", "point", position=p, intensity=[9, 9, 9])
         for i, p in enumerate([(5, 5, 5), (5, -5, 2)])
@@ -86,7 +86,7 @@ def test_names_that_collide_or_leave_the_folder_are_refused(field, tmp_path):
 
 def test_turntable_keeps_the_object_in_view_and_turns_about_up():
     points = np.random.default_rng(3).normal(size=(200, 3)) * [1, 2, 0.5] + [5, 0, -2]
-    options = OrbitOptions(n_frames=7, up=(0, 2, 0), elevation_deg=-35, size=101)
+    options = OrbitOptions(n_images=7, up=(0, 2, 0), elevation_deg=-35, size=101)
     cameras = orbit_cameras(points, options)
     middle = 0.5 * (points.min(0) + points.max(0))
     for camera in cameras:
@@ -99,14 +99,14 @@ def test_turntable_keeps_the_object_in_view_and_turns_about_up():
     assert np.allclose(np.linalg.norm(steps, axis=1), np.linalg.norm(steps[0]))
 
 
-def test_turntable_writes_frames_animation_and_sheet(field, tmp_path):
+def test_turntable_writes_images_animation_and_sheet(field, tmp_path):
     seen = []
     light = Light("l", "directional", direction=[1, 1, 1], intensity=[2, 2, 2])
-    options = OrbitOptions(n_frames=5, size=20, frames_per_second=10)
+    options = OrbitOptions(n_images=5, size=20, frames_per_second=10)
     with listening(lambda text, done, total: seen.append((done, total))):
         orbit = render_orbit(field, light, tmp_path / "orbit", options, FAST)
     assert seen == [(i, 5) for i in range(6)]
-    assert [path.name for path in orbit.frames] == [f"orbit_{i:03d}.png" for i in range(5)]
+    assert [path.name for path in orbit.images] == [f"orbit_{i:03d}.png" for i in range(5)]
     with Image.open(orbit.animation) as animation:
         assert (animation.n_frames, animation.size) == (5, (20, 20))
         animation.seek(1)
@@ -114,7 +114,7 @@ def test_turntable_writes_frames_animation_and_sheet(field, tmp_path):
         assert animation.info["duration"] == 100
     with Image.open(orbit.contact_sheet) as sheet:
         assert sheet.size == (60, 40)
-        with Image.open(orbit.frames[4]) as last:
+        with Image.open(orbit.images[4]) as last:
             tile = np.asarray(sheet)[20:40, 20:40]
             assert np.array_equal(tile, np.asarray(last))
     again = render_orbit(field, light, tmp_path / "again", options, FAST)
@@ -125,7 +125,7 @@ def test_turntable_writes_frames_animation_and_sheet(field, tmp_path):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"n_frames": 0}, "n_frames"),
+        ({"n_images": 0}, "n_images"),
         ({"up": (0, 0, 0)}, "up: expected"),
         ({"elevation_deg": 90}, "elevation_deg"),
         ({"field_of_view_deg": 0}, "field_of_view_deg"),
