@@ -144,7 +144,7 @@ INPUTS = {
     "a silhouette": (another_silhouette, {"silhouettes", "hull", *AFTER_HULL}),
     "a photograph": (bits(photograph("training")), {*REFLECTANCE}),
     "a held-out photograph": (
-        bits(photograph("frames")),
+        bits(photograph("compared_capture")),
         {*IMAGES},
     ),
     "the capture's name": (
