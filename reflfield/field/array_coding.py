@@ -30,8 +30,8 @@ FILTERS = ("none", "delta", "fresh")
 KNOWN_FILTERS = {"faces": "fresh", "texel_of_pixel": "delta", "turns": "none"}
 TRIED_FILTERS = ("none", "delta")
 # Of an array that is larger than this, ways are tried on the first rows, of so many bytes, and
-# repetitions are looked for over a short distance, in the processor's cache: coefficients of 6 MB
-# take a quarter of the time and half a percent more bytes, frames of 3 MB half and one percent.
+# repetitions are looked for over a short distance, in the processor's cache: coefficients of
+# 6 MB take a quarter of the time and half a percent more bytes, frames of 3 MB half and one.
 LARGE_BYTES, SAMPLE_BYTES = 2 << 20, 1 << 19
 SHORT_DISTANCE = 1 << 16
 
