@@ -149,6 +149,38 @@ def test_no_import_hides_inside_a_function(package):
     assert hidden == {}
 
 
+def prints(tree: ast.AST) -> list[int]:
+    """Lines that call print, or that use the module which writes to the terminal."""
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id == "print"
+        )
+        or (isinstance(node, ast.ImportFrom) and node.module == "reflfield.util.terminal")
+    ]
+
+
+def test_only_commands_print():
+    """The library tells through logging and progress; scripts that it exports are programs."""
+    printing = {
+        str(path): lines
+        for path in modules("reflfield")
+        if package_of(path) != "cli"
+        and path != Path("reflfield/util/terminal.py")
+        and path.parts[2:3] not in [("mitsuba_scene",), ("blender_scene",)]
+        and (lines := prints(ast.parse((ROOT / path).read_text(encoding="utf-8"))))
+    }
+    assert printing == {}
+
+
+def test_the_check_of_printing_sees_what_it_must():
+    source = "print(1)\nfrom reflfield.util.terminal import say\n'print(2)'\n"
+    assert sorted(prints(ast.parse(source))) == [1, 2]
+
+
 def test_the_check_sees_what_it_must():
     source = (
         "from reflfield.field import evaluation\n"
