@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from reflfield.capture.capture import PLANE, Capture
 from reflfield.capture.inspect import object_centre, spread_evenly
-from reflfield.capture.lights import ENVIRONMENT, GROUP
 from reflfield.checking.checked_views import CheckedView, UnusableView, checked_views
 from reflfield.checking.description_findings import (
     code_range_finding,
@@ -22,6 +21,7 @@ from reflfield.checking.description_findings import (
 )
 from reflfield.checking.findings import ERROR, Finding, Findings
 from reflfield.checking.flat_surface import axes_findings, flat_samples
+from reflfield.checking.left_out import all_left_out, left_out_findings, without_surface
 from reflfield.checking.light_findings import (
     Misplaced,
     gain_findings,
@@ -182,10 +182,11 @@ def _of_surface(
     capture: Capture, photographs: PhotographSet, shape: Shape, fits: list[PhotographFits]
 ) -> Iterator[Finding]:
     """Findings on lights and photographs, by what a coarse hull should look like."""
-    one_lamp = all(light.kind not in (ENVIRONMENT, GROUP) for light in capture.lights)
-    if shape.mesh is None or not capture.lights_known or not one_lamp:
+    why = without_surface(capture, shape)
+    if shape.mesh is None or why:
+        yield all_left_out(why)
         return
-    numbers = [view.number for view in shape.views if view.number not in shape.wrong]
+    numbers = [view.number for view in shape.views if view.number not in shape.astray]
     samples = sample_surface(capture, shape.mesh, photographs, numbers)
     coverage = {view.number: view.coverage for view in shape.views}
     looks = _looks(capture, samples)
@@ -199,6 +200,7 @@ def _of_surface(
             "correct the lights' positions, their order, or the axes they are in",
             str(capture.description or ""),
         )
+        yield all_left_out("the axes of the lights are in doubt")
         return
     shading = shading_of(capture, samples)
     fits.append(PhotographFits(capture, photographs, shading, shading.fits()))
@@ -251,6 +253,7 @@ def _of_shading(
         )
     yield from ambient_findings(capture, shading)
     yield from vignetting_findings(shading, capture)
+    yield from left_out_findings(by_fit)
 
 
 def _without_lights(by_fit: PhotographFits, lights: set[int]) -> PhotographFits:

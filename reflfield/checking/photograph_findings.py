@@ -71,11 +71,11 @@ class PhotographFits:
         for group in groups:
             loss = np.minimum(loss, _below_group(own, np.array(group)))
         _, scatter = robust_spread(loss)
-        lit = self._lit()
+        lit = self.lit()
         rows = np.flatnonzero(lit & (loss > max(LEAST_LOSS, LOSS_DEVIATIONS * scatter)))
         return [int(row) for row in rows[np.argsort(-loss[rows], kind="stable")]]
 
-    def _lit(self) -> NDArray[np.bool_]:
+    def lit(self) -> NDArray[np.bool_]:
         """Whether a light shines on enough of what a photograph shows to tell its place."""
         samples = self.shading.samples
         shares = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,15 +53,16 @@ class Shape:
     views : tuple of CheckedView
     edges : dict of int to MaskEdge
         By number of the camera, where photographs show the object before an even backdrop.
-    wrong : frozenset of int
-        Cameras whose views contradict the others.
+    astray : frozenset of int
+        Cameras whose views contradict the others though no photograph says that it is the
+        mask: where they see a point is not known.
     mesh : Mesh or None
         Coarse hull of those that agree.
     """
 
     views: tuple[CheckedView, ...]
     edges: dict[int, MaskEdge]
-    wrong: frozenset[int]
+    astray: frozenset[int]
     mesh: Mesh | None
 
 
@@ -187,7 +189,7 @@ def contradiction_findings(
     box = robust_bounds(cones) if len(cones) >= 2 else None
     if len(views) < FEWEST_VIEWS or box is None:
         failures = [] if len(views) < FEWEST_VIEWS else [_nothing_common(views)]
-        return failures, Shape(tuple(views), edges, frozenset(doubted), None)
+        return failures, Shape(tuple(views), edges, frozenset(), None)
     margin = 0.05 * (box[1] - box[0])
     low, high = box[0] - margin, box[1] + margin
     agreement = outline_agreement(cones, low, high)
@@ -198,10 +200,14 @@ def contradiction_findings(
     findings: list[Finding] = []
     if not verdict.agree:
         findings.append(_all_contradict(views, verdict))
-    findings += [
-        _outlier(capture, views, i, outliers, verdict, doubted, mesh, (low, high), edges)
-        for i in outliers
-    ]
+    astray = set()
+    for i in outliers:
+        words = _contradicted(verdict, i, len(good))
+        finding = _by_photographs(capture, views, i, outliers, doubted, words, mesh, edges)
+        if finding is None:
+            astray.add(views[i].number)
+            finding = _outlier(capture, views, i, outliers, words, mesh, (low, high), edges)
+        findings.append(finding)
     named = {views[i].number for i in outliers}
     findings += [
         _wrong_mask(capture, view, doubted[view.number], edges)
@@ -213,7 +219,7 @@ def contradiction_findings(
         findings += _focal(capture, good, low, high)
     if failure and verdict.agree:
         findings.append(Finding("no hull", ERROR, (), failure, "see the findings above"))
-    return findings, Shape(tuple(views), edges, frozenset(named | set(doubted)), mesh)
+    return findings, Shape(tuple(views), edges, frozenset(astray), mesh)
 
 
 def _is_certain(view: CheckedView, edges: dict[int, MaskEdge]) -> bool:
@@ -267,41 +273,59 @@ def _hull(views: Sequence[CheckedView]) -> tuple[Mesh | None, str]:
         return None, str(error)
 
 
-def _outlier(
+def _contradicted(verdict: Verdict, number: int, n_others: int) -> str:
+    return (
+        f"its outline contradicts the {n_others} others (they exclude "
+        f"{100 * verdict.uncovered[number]:.0f} % of it)"
+    )
+
+
+def _by_photographs(
     capture: Capture,
     views: Sequence[CheckedView],
     number: int,
     outliers: Sequence[int],
-    verdict: Verdict,
     doubted: dict[int, str],
+    evidence: str,
     mesh: Mesh | None,
-    box: tuple[Array, Array],
     edges: dict[int, MaskEdge],
-) -> Finding:
-    """What is wrong with a view that contradicts the others."""
+) -> Finding | None:
+    """What is wrong with the mask of a view, if its photographs say that it is the mask."""
     view = views[number]
-    others = [v for i, v in enumerate(views) if i not in outliers]
-    swapped = [(views[j].name, views[j].coverage) for j in outliers if j != number]
-    why = explain_view(view.camera, view.coverage, mesh, swapped) if mesh else None
     edge = edges.get(view.number)
-    mask_fits = edge is not None and view.number not in doubted
-    error: CameraError | None = None
-    if list(outliers).index(number) < MOST_FITTED and view.number not in doubted:
-        error = camera_error(view.cone, [v.cone for v in others], *box)
-    evidence = (
-        f"its outline contradicts the {len(others)} others (they exclude "
-        f"{100 * verdict.uncovered[number]:.0f} % of it)"
-    )
-    pictures = _overlaps(view, mesh, edge)
     if edge is not None and is_hole(edge):
         return _hole(capture, view, edges)
     if view.number in off_edges(views, edges):
         return _edge(capture, "mask", [view], off_edges(views, edges)[view.number], edges)
     doubt = doubted.get(view.number) or _beyond(view, mesh, edge)
     if doubt:
+        why = _explained(views, number, outliers, mesh)
         return _wrong_mask(capture, view, f"{doubt}; {evidence}", edges, why)
+    return None
+
+
+def _outlier(
+    capture: Capture,
+    views: Sequence[CheckedView],
+    number: int,
+    outliers: Sequence[int],
+    evidence: str,
+    mesh: Mesh | None,
+    box: tuple[Array, Array],
+    edges: dict[int, MaskEdge],
+) -> Finding:
+    """What is wrong with a view that contradicts the others, by the silhouettes alone."""
+    view = views[number]
+    others = [v.cone for i, v in enumerate(views) if i not in outliers]
+    why = _explained(views, number, outliers, mesh)
+    edge = edges.get(view.number)
+    mask_fits = edge is not None
+    pictures = _overlaps(view, mesh, edge)
     if why is not None and ("pose" in why.kind or "axes" in why.kind):
         return _named("pose of a camera", view, capture, f"{evidence}; {why.words}", pictures)
+    error: CameraError | None = None
+    if list(outliers).index(number) < MOST_FITTED:
+        error = camera_error(view.cone, others, *box)
     if error is not None:
         return _camera(view, capture, f"{evidence}", error, pictures, mask_fits)
     if why is not None:
@@ -311,16 +335,35 @@ def _outlier(
     return _named(kind, view, capture, evidence, pictures)
 
 
+def _explained(
+    views: Sequence[CheckedView], number: int, outliers: Sequence[int], mesh: Mesh | None
+) -> Explanation | None:
+    """What would make a silhouette agree with the others' hull."""
+    view = views[number]
+    swapped = [(views[j].name, views[j].coverage) for j in outliers if j != number]
+    return explain_view(view.camera, view.coverage, mesh, swapped) if mesh else None
+
+
 def _beyond(view: CheckedView, mesh: Mesh | None, edge: MaskEdge | None) -> str:
     """Words on a part of a mask that neither the others nor the photographs show."""
     if mesh is None or edge is None:
         return ""
     mask = view.coverage >= 0.5
-    beyond = mask & ~RayScene(mesh).silhouette(view.camera)
+    beyond = mask & _far_outside(RayScene(mesh).silhouette(view.camera))
     share = float(beyond.sum() / mask.sum())
     if share < LEAST_PART or (beyond & edge.shown).sum() > 0.5 * beyond.sum():
         return ""
     return f"{100 * share:.0f} % of it lie outside of the others' hull and show backdrop"
+
+
+def _far_outside(silhouette: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels farther from the silhouette of the coarse hull than its voxels are wide."""
+    distance = cv2.distanceTransform((~silhouette).astype(np.uint8), cv2.DIST_L2, 5)
+    if not silhouette.any():
+        return np.ones_like(silhouette)
+    rows, columns = np.nonzero(silhouette)
+    voxel = max(np.ptp(rows), np.ptp(columns)) / RESOLUTION
+    return np.asarray(distance > 1 + voxel)
 
 
 def _named(

@@ -102,6 +102,30 @@ def test_faults_of_masks_and_cameras_are_named(planted, check_folder):
     assert len(grave(findings)) == 4
 
 
+def test_a_swap_between_views_of_a_dark_underside_is_named(planted, check_folder):
+    """Lights stand above: seen from below, parts of the object are as dark as the backdrop."""
+    pair = (0, 0), (2, 2)
+    f.swap_files(*(planted.photograph(*place) for place in pair))
+    names = {planted.photograph(*place).stem for place in pair}
+    assert named(check_folder(planted.folder), "swapped photographs") == names
+
+
+@pytest.mark.parametrize("view", [3, 16])
+def test_a_patch_of_backdrop_in_a_mask_is_a_fault_of_the_mask(view, planted, check_folder):
+    planted.change_mask(view, f.with_blob)
+    findings = check_folder(planted.folder)
+    assert named(findings, "wrong mask") == set(planted.names("cameras", view))
+    assert grave(findings) == {"wrong mask"}
+
+
+def test_photographs_that_are_not_compared_are_in_a_note(planted, check_folder):
+    f.turn_camera(planted, 9, [0.0, 1.0, 0.0])
+    left_out = named(check_folder(planted.folder), "not checked")
+    assert left_out >= set(planted.names("cameras", 9))
+    # The lowest lights stand behind the object of some views.
+    assert not left_out.isdisjoint({planted.photograph(4, light).stem for light in range(5)})
+
+
 @pytest.mark.parametrize(
     "name",
     [
