@@ -39,6 +39,9 @@ CAMERA_KEYS = (
     "camera_angle_x", "camera_angle_y", "camera_intrinsics",
 )  # fmt: skip
 
+# Focal lengths of angles that are written with three digits differ by less, relatively.
+ANGLE_ROUNDING = 2e-3
+
 # OpenGL camera axes (x right, y up, z back) seen from OpenCV's (x right, y down, z forward).
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -106,13 +109,23 @@ def frame_size(frame: Frame, path: Path) -> tuple[int, int]:
     Raises
     ------
     CaptureError
-        If a stated size is out of range, or there is no photograph to ask.
+        If a stated size is out of range, one side that is stated alone is not that of the
+        photograph, or there is no photograph to ask.
     """
-    if frame.get("w") is not None and frame.get("h") is not None:
-        return _pixels(frame, "w"), _pixels(frame, "h")
-    if path.is_file():
-        return image_size(path)
-    raise CaptureError(f"{frame.what}: expected 'w' and 'h', since {path} does not exist")
+    stated = {name: _pixels(frame, name) for name in "wh" if frame.get(name) is not None}
+    if len(stated) == 2:
+        return stated["w"], stated["h"]
+    if not path.is_file():
+        raise CaptureError(f"{frame.what}: expected 'w' and 'h', since {path} does not exist")
+    size = image_size(path)
+    for name, length in zip("wh", size, strict=True):
+        if stated.get(name, length) != length:
+            raise CaptureError(
+                f"{frame.what}: {name}: expected the {size[0]} x {size[1]} pixels of {path}, "
+                f"received {stated[name]}; give 'w', 'h' and the lens for the photograph as "
+                "it is"
+            )
+    return size
 
 
 def _pixels(frame: Frame, name: str) -> int:
@@ -199,6 +212,36 @@ def _stated(
     if lengths["x"] is not None and lengths["y"] is None:
         stated["y"] = None  # square pixels rather than an angle that belongs to another fl_x
     return {**stated, "is_length": 1.0 if any(lengths.values()) else None}
+
+
+def contradicted_angle(frame: Frame, size: tuple[int, int]) -> str | None:
+    """Say which angle of view is not that of the focal length which stands beside it.
+
+    The length is used, as other readers do: some programs write the angles of the whole
+    sensor, whatever the image shows of it.
+
+    Parameters
+    ----------
+    frame : Frame
+    size : (width, height) int
+    """
+    for level in frame.levels:
+        angles = {
+            axis: _from_angle(frame, level, f"camera_angle_{axis}", side)
+            for axis, side in zip("xy", size, strict=True)
+        }
+        stated = _stated(frame, level, *size)
+        lengths = {axis: stated[axis] or stated["x"] for axis in "xy"}  # square pixels
+        for axis, length in lengths.items():
+            angle = angles[axis]
+            if length and angle and not math.isclose(length, angle, rel_tol=ANGLE_ROUNDING):
+                return (
+                    f"camera_angle_{axis} means a focal length of {angle:.6g} pixels, and "
+                    f"{length:.6g} stand beside it"
+                )
+        if any(lengths.values()):
+            return None  # the file's are not used
+    return None
 
 
 def _length(frame: Frame, level: Mapping[str, Any], name: str) -> float | None:

@@ -27,7 +27,12 @@ from reflfield.capture.names import IMAGE_SUFFIXES, unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
 from reflfield.capture.stated_readings import READING_KEYS, stated_reading
-from reflfield.capture.transforms_camera import CAMERA_KEYS, frame_camera, frame_size
+from reflfield.capture.transforms_camera import (
+    CAMERA_KEYS,
+    contradicted_angle,
+    frame_camera,
+    frame_size,
+)
 from reflfield.capture.transforms_frame import SPLIT_KEYS, Frame, check_keys
 from reflfield.capture.transforms_light import LIGHT_KEYS, check_lights, frame_light
 from reflfield.capture.unique_items import UniqueItems, camera_key, numbered
@@ -51,6 +56,7 @@ class _Reading:
     photographs: list[Photograph] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     said: dict[str, int] = field(default_factory=dict)
+    contradicted: list[str] = field(default_factory=list)
     readings: dict[str, ImageReading] = field(default_factory=dict)
 
     def add(self, frame: Frame, is_test: bool) -> None:
@@ -71,6 +77,9 @@ class _Reading:
         if said not in self.said:
             camera = frame_camera(frame, path.stem, size)
             self.said[said] = self.cameras.add(camera_key(camera), camera)
+            contradicted = contradicted_angle(frame, size)
+            if contradicted:
+                self.contradicted.append(f"{frame.what}: {contradicted}")
         return self.said[said]
 
     def _light(self, frame: Frame) -> int:
@@ -141,7 +150,7 @@ def read_transforms(
     check_lights(used)
     for number, frame in enumerate(used):
         reading.add(frame, is_test=number >= len(train))
-    reading.notes += _mask_notes(reading, description)
+    reading.notes += _mask_notes(reading, description) + _angle_notes(reading)
     return _capture(reading, document, description)
 
 
@@ -155,6 +164,14 @@ def _mask_notes(reading: _Reading, description: Path) -> list[str]:
         f"cameras have several masks, of which the first is used ({reading.silhouettes[view]}, "
         f"not {other})"
     ]
+
+
+def _angle_notes(reading: _Reading) -> list[str]:
+    """Say that focal lengths are used, where angles contradict them."""
+    if not reading.contradicted:
+        return []
+    count = f"{len(reading.contradicted)} of {len(reading.cameras.items)} cameras"
+    return [f"{reading.contradicted[0]} ({count}); the length is used"]
 
 
 def _capture(reading: _Reading, document: Mapping[str, Any], description: Path) -> Capture:

@@ -1,6 +1,7 @@
 """transforms.json as other programs write it: read as its maker meant it, or refused."""
 
 import json
+import re
 import unicodedata
 
 import cv2
@@ -138,6 +139,39 @@ class TestIntrinsics:
         top = {"fl_x": 12.0, "camera_angle_x": 1.0, "camera_angle_y": 1.0, "w": 8, "h": 6}
         camera = opened(tmp_path, [frame()], top).cameras[0]
         assert (camera.fl_x, camera.fl_y) == (12, 12)
+
+    @pytest.mark.parametrize(
+        ("own", "top", "said"),
+        [
+            ({}, {"fl_x": 12.0, "camera_angle_x": 1.0}, "x means a focal length of 7.32195 "),
+            ({"fl_x": 12.0, "camera_angle_x": 1.0}, {}, "x means .*7.32195 pixels, and 12 "),
+            ({"camera_intrinsics": [4, 3, 9, 9], "camera_angle_x": 1.0}, {}, "x .*and 9 stand"),
+            # of the whole sensor, as Blender's angle of a square picture is
+            ({}, {"fl_x": 9.0, "fl_y": 9.0, "camera_angle_y": 0.2}, "y means"),
+            ({}, {"fl_x": 9.0, "camera_angle_y": 0.2}, "y means"),
+            ({}, {"fl_x": 9.0, "camera_angle_x": 0.836}, None),  # rounded
+            ({"camera_angle_x": 1.0}, {"fl_x": 12.0}, None),  # not in the same place
+            ({"fl_x": 12.0}, {"fl_x": 9.0, "camera_angle_x": 1.0}, None),  # not used
+            ({}, {"fl_x": 12.0, "camera_angle_x": 1.0, "is_fisheye": True}, None),
+        ],
+    )
+    def test_angles_that_contradict_the_length_beside_them_are_said(
+        self, tmp_path, own, top, said
+    ):
+        frames = [frame("a", **own), frame("b", **own)]
+        notes = opened(tmp_path, frames, {"w": 8, "h": 6} | top).notes
+        assert len(notes) == (said is not None)
+        if said:
+            assert re.search(rf"frame 0 \('a'\): camera_angle_{said}.*\(1 of 1 cam", notes[0])
+
+    @pytest.mark.parametrize("side", [{"w": 16}, {"h": 12}])
+    def test_one_side_that_is_not_the_photographs(self, tmp_path, side):
+        write_png(tmp_path / "a.png", np.zeros((6, 8, 3), np.uint8))
+        with pytest.raises(CaptureError, match=r"[wh]: expected the 8 x 6 pixels of .*a\.png"):
+            opened(tmp_path, [frame("a.png")], {"fl_x": 10.0} | side)
+        right = {name: length // 2 for name, length in side.items()}
+        camera = opened(tmp_path, [frame("a.png")], {"fl_x": 10.0} | right).cameras[0]
+        assert (camera.width, camera.height) == (8, 6)
 
     def test_only_the_vertical_angle(self, tmp_path):
         camera = opened(tmp_path, [frame()], {"camera_angle_y": np.pi / 2, "w": 8, "h": 6})
