@@ -47,9 +47,11 @@ def light_references(
     InputError
         If a text has another form, a number is not positive, or no sphere is named.
     """
-    for name, value in (("radius", radius), ("focal", focal)):
-        if value is not None and not 0 < value < 1e12:
-            raise InputError(f"{name}: expected a number above 0, below 1e12, received {value}")
+    for name, value, least in (("radius", radius, 1e-9), ("focal", focal, 1.0)):
+        if value is not None and not least <= value <= 1e9:
+            raise InputError(
+                f"{name}: expected a number of {least:g} to 1e+09, received {value}"
+            )
     n_sought = sum(text == AUTO for text in spheres)
     if 0 < n_sought < len(spheres):
         raise InputError("sphere: expected x,y,r of all spheres, or 'auto' for all")

@@ -32,6 +32,8 @@ TABLE, DIRECTIONS = "lights.csv", "lights.lp"
 # Photographs that circles are sought in, evenly spread.
 MOST_SEARCHED = 24
 SUFFIXES = (".exr", ".tif", ".tiff", ".png", ".jpg", ".jpeg", ".hdr", ".cr2", ".nef", ".dng")
+# Lenses with straight lines have at least this focal length, in the longer side of the image.
+SHORTEST_FOCAL = 0.25
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -172,6 +174,7 @@ def _light(
     references: References,
 ) -> CalibratedLight:
     height, width = image.shape[:2]
+    _check_focal(references.focal, width, height)
     matt = references.matt_sphere
     for circle in (*references.spheres, *([matt] if matt else [])):
         circle.check_within(width, height)
@@ -195,6 +198,17 @@ def _light(
     if intensity is not None and position is not None and matt is not None:
         intensity *= float(np.sum(np.square(position - camera.centre_of(matt))))
     return CalibratedLight(name, direction, position, intensity, spread)
+
+
+def _check_focal(focal: float | None, width: int, height: int) -> None:
+    """Refuse a lens wider than there are: its length is in millimetres."""
+    least = SHORTEST_FOCAL * max(width, height)
+    if focal is not None and focal < least:
+        raise InputError(
+            f"focal: expected at least {least:g} pixels for an image of {width} x {height}, "
+            f"received {focal:g}; is it in millimetres? Multiply it by the pixels of a "
+            "millimetre of the sensor"
+        )
 
 
 def _mean_direction(rays: Sequence[Ray]) -> tuple[Array, float]:
@@ -229,7 +243,7 @@ def photographs_in(paths: Sequence[Path]) -> list[Path]:
     Raises
     ------
     InputError
-        If there are none, or one does not exist.
+        If there are none, one does not exist, or names cannot stand in a list of lights.
     """
     files: list[Path] = []
     for path in paths:
@@ -243,7 +257,25 @@ def photographs_in(paths: Sequence[Path]) -> list[Path]:
             )
     if not files:
         raise InputError(f"{paths[0]}: expected photographs, received none")
+    _check_names(files)
     return files
+
+
+def _check_names(files: Sequence[Path]) -> None:
+    """Refuse names that cannot stand in a list of lights, or that two photographs have."""
+    seen: dict[str, Path] = {}
+    for file in files:
+        if not file.name.isprintable() or file.name != file.name.strip():
+            raise InputError(
+                f"{file}: expected a name without control characters and without spaces at "
+                f"its ends, received {printable(file.name)!r}; rename it"
+            )
+        if file.name in seen:
+            raise InputError(
+                f"{file}: expected names that differ, received that of {seen[file.name]}, too; "
+                "lights are listed by names: calibrate each folder by itself, or rename one"
+            )
+        seen[file.name] = file
 
 
 def write_lights(folder: Path, lights: Sequence[CalibratedLight]) -> tuple[Path, Path]:

@@ -5,7 +5,7 @@ import pytest
 
 from reflfield.api.light_calibration import light_references, lights_of_photographs
 from reflfield.calibration.circles import Circle, find_circles, parse_circle
-from reflfield.calibration.reference_lights import write_lights
+from reflfield.calibration.reference_lights import photographs_in, write_lights
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.errors import InputError
 
@@ -158,3 +158,35 @@ def test_given_directions_of_chrome_spheres_are_met(shared_data):
     stated = np.loadtxt(folder / "light_directions.txt").T
     cosine = (mean * stated).sum(axis=1) / np.linalg.norm(mean, axis=1)
     assert np.degrees(np.arccos(cosine)).max() < 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("radius", 5e-324), ("radius", 0), ("radius", 1e300), ("focal", 5e-324), ("focal", -9)],
+)
+def test_lengths_beyond_their_range_are_refused(name, value):
+    with pytest.raises(InputError, match=rf"{name}: expected a number of .* to 1e\+09"):
+        light_references([text(LEFT)], **{name: value})
+
+
+def test_a_focal_length_in_millimetres_is_refused(folder):
+    with pytest.raises(InputError, match=r"focal: expected at least 60 pixels.*in millimetres"):
+        lights_of_photographs([folder], light_references([text(LEFT)], focal=50))
+
+
+@pytest.mark.parametrize("name", ["a\n.exr", "\x1b[2J.exr", " a.exr", "\udcff.exr"])
+def test_names_that_cannot_stand_in_a_list_of_lights_are_refused(tmp_path, name):
+    try:
+        (tmp_path / name).touch()
+    except OSError:
+        pytest.skip("the file system has no such names")
+    with pytest.raises(InputError, match="expected a name without control characters"):
+        photographs_in([tmp_path])
+
+
+def test_photographs_of_one_name_in_two_folders_are_refused(tmp_path):
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.exr").touch()
+    with pytest.raises(InputError, match=r"two.a\.exr: expected names that differ"):
+        photographs_in([tmp_path / "one", tmp_path / "two"])
