@@ -134,28 +134,92 @@ class FrameErrors:
         return statistics
 
 
-def frame_errors(
-    positions: ArrayLike,
-    local_from_world: ArrayLike,
-    surface: SurfacePoints,
-    max_distance: float,
-    targets: ArrayLike | None = None,
-) -> FrameErrors:
-    """Angles of texel frames to the true shading frames nearest to them.
+@dataclass(frozen=True, eq=False)
+class TrueFrames:
+    """True normals and tangents at texels that the true surface is near to.
+
+    Parameters
+    ----------
+    n_texels : int
+        All texels, matched or not.
+    texel : (n_matched,) int64
+        Texels that have a true frame near them.
+    normal, tangent : (n_matched, 3) float64
+        World frame; unit vectors up to interpolation.
+    label : (n_matched,) int64
+        Material of the nearest surface point.
+    """
+
+    n_texels: int
+    texel: NDArray[np.int64]
+    normal: Array
+    tangent: Array
+    label: NDArray[np.int64]
+
+    def of(self, chosen: NDArray[np.bool_]) -> TrueFrames:
+        """Those of some of the matched texels."""
+        return TrueFrames(
+            self.n_texels,
+            self.texel[chosen],
+            self.normal[chosen],
+            self.tangent[chosen],
+            self.label[chosen],
+        )
+
+
+def true_frames(
+    positions: ArrayLike, surface: SurfacePoints, max_distance: float
+) -> TrueFrames:
+    """True shading frames nearest to texels.
 
     Parameters
     ----------
     positions : (n_texels, 3) array_like
         Metres, world frame.
-    local_from_world : (n_texels, 3, 3) array_like
-        Rows tangent, binormal, normal: recovered frames, or base frames for
-        comparison. Frames that are not finite are left out.
     surface : SurfacePoints
         From `surface_points`. Between its points normals and tangents are
         interpolated linearly, within one material.
     max_distance : float
         Texels farther than this from any true point are left out, metres: where
         the hull bridges a hollow, no texel shows one point of the surface.
+
+    Returns
+    -------
+    TrueFrames
+
+    Raises
+    ------
+    ShapeError
+        If the positions are not (n_texels, 3).
+    """
+    texels = np.asarray(positions, dtype=np.float64)
+    check_shape("positions", texels, (None, 3))
+    nothing = np.zeros(0, np.int64)
+    if not len(surface.position):
+        return TrueFrames(len(texels), nothing, np.zeros((0, 3)), np.zeros((0, 3)), nothing)
+    tree = cKDTree(surface.position)
+    distance, nearest = tree.query(texels)
+    matched = np.flatnonzero(distance <= max_distance)
+    true = [(np.zeros((0, 3)), np.zeros((0, 3)))]
+    for first in range(0, len(matched), TEXELS_PER_BLOCK):
+        block = matched[first : first + TEXELS_PER_BLOCK]
+        true.append(_interpolated_frames(tree, surface, texels[block]))
+    normal, tangent = (np.concatenate(part) for part in zip(*true, strict=True))
+    return TrueFrames(len(texels), matched, normal, tangent, surface.label[nearest[matched]])
+
+
+def frame_errors(
+    true: TrueFrames, local_from_world: ArrayLike, targets: ArrayLike | None = None
+) -> FrameErrors:
+    """Angles of texel frames to the true shading frames nearest to them.
+
+    Parameters
+    ----------
+    true : TrueFrames
+        From `true_frames`, for the same texels.
+    local_from_world : (n_texels, 3, 3) array_like
+        Rows tangent, binormal, normal: recovered frames, or base frames for
+        comparison. Frames that are not finite are left out.
     targets : (n_texels,) array_like of int, optional
         Target that each texel was aligned to: one rotation about the normal is removed for
         each of them and each material, see `UndeterminedRotation`. None removes nothing.
@@ -177,40 +241,28 @@ def frame_errors(
     >>> point = SurfacePoints(*np.eye(3)[[0, 2, 0], None], np.zeros(1, int))
     >>> turned = np.diag([-1.0, -1.0, 1.0])
     >>> tilted = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    >>> errors = frame_errors(np.eye(3)[[0, 0]], np.stack([turned, tilted]), point, 0.1)
+    >>> true = true_frames(np.eye(3)[[0, 0]], point, 0.1)
+    >>> errors = frame_errors(true, np.stack([turned, tilted]))
     >>> errors.normal.round(9).tolist(), errors.tangent.round(9).tolist()
     ([0.0, 90.0], [0.0, 0.0])
     """
-    texels = np.asarray(positions, dtype=np.float64)
-    frames = np.asarray(local_from_world, dtype=np.float64)
-    check_shape("positions", texels, (None, 3))
-    check_shape("local_from_world", frames, (len(texels), 3, 3))
-    nothing = np.zeros(0, np.int64)
-    if not len(surface.position):
-        return FrameErrors(nothing, np.zeros(0), np.zeros(0), nothing)
-    tree = cKDTree(surface.position)
-    distance, nearest = tree.query(texels)
-    usable = (distance <= max_distance) & np.isfinite(frames).all(axis=(1, 2))
-    matched, own_frames = np.flatnonzero(usable), frames[usable]
-    true = [(np.zeros((0, 3)), np.zeros((0, 3)))]
-    for first in range(0, len(matched), TEXELS_PER_BLOCK):
-        block = matched[first : first + TEXELS_PER_BLOCK]
-        true.append(_interpolated_frames(tree, surface, texels[block]))
-    normal, tangent = (np.concatenate(part) for part in zip(*true, strict=True))
-    label = surface.label[nearest[matched]]
+    given = np.asarray(local_from_world, dtype=np.float64)
+    check_shape("local_from_world", given, (true.n_texels, 3, 3))
+    true = true.of(np.asarray(np.isfinite(given[true.texel]).all(axis=(1, 2))))
+    frames = given[true.texel]
     rotations: tuple[UndeterminedRotation, ...] = ()
-    own_tangent = own_frames[:, 0]
+    tangent = frames[:, 0]
     if targets is not None:
         target = np.asarray(targets)
-        check_shape("targets", target, (len(texels),))
-        rotations, own_tangent = _without_undetermined_rotations(
-            own_frames, normal, tangent, target[matched], label
+        check_shape("targets", target, (true.n_texels,))
+        rotations, tangent = _without_undetermined_rotations(
+            frames, true.normal, true.tangent, target[true.texel], true.label
         )
     return FrameErrors(
-        matched,
-        angle_deg(own_frames[:, 2], normal),
-        _line_angle_deg(own_tangent, tangent),
-        label,
+        true.texel,
+        angle_deg(frames[:, 2], true.normal),
+        _line_angle_deg(tangent, true.tangent),
+        true.label,
         rotations,
     )
 

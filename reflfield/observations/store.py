@@ -15,6 +15,7 @@ that halves hold them whatever the units of radiance, intensity and length are.
 from __future__ import annotations
 
 import atexit
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -124,10 +125,15 @@ class Observed:
         """(k, n_photographs) True where a sample of some texels was measured."""
         return self.pairs.both(self.views[texels], self.lights[texels])
 
-    def views_under_lights(self) -> NDArray[np.float32]:
-        """(n_texels, n_lights) photographs under each light whose cameras see the texel."""
+    def part(self, texels: slice) -> Observed:
+        """The same of some texels."""
+        return Observed(self.views[texels], self.lights[texels], self.pairs)
+
+    def counts(self) -> NDArray[np.float32]:
+        """(n_texels, n_lights) samples measured under each light."""
         # Floats go through BLAS; the counts of views are exact in them.
-        return self.views.astype(np.float32) @ self.pairs.table.astype(np.float32)
+        seen = self.views.astype(np.float32) @ self.pairs.table.astype(np.float32)
+        return seen * self.lights
 
     def count(self) -> int:
         """Number of samples measured.
@@ -140,12 +146,31 @@ class Observed:
         >>> Observed(views, np.ones((2, 3), bool), PhotographedPairs.product(2, 3)).count()
         9
         """
-        total = 0.0
+        return int(sum(some.counts().sum(dtype=np.float64) for _, some in self._blocks()))
+
+    def count_seen(self) -> int:
+        """Number of samples whose camera sees the texel, lit or not.
+
+        Examples
+        --------
+        >>> views, dark = np.array([[True, True], [True, False]]), np.zeros((2, 3), bool)
+        >>> Observed(views, dark, PhotographedPairs.product(2, 3)).count_seen()
+        9
+        """
+        return int(self.views.sum(axis=0) @ self.pairs.table.sum(axis=1))
+
+    def counted(self) -> Bools:
+        """(n_texels, n_lights) True where a camera sees the texel under a light that counts."""
+        counted = np.zeros((len(self.views), self.pairs.n_lights), np.bool_)
+        for part, some in self._blocks():
+            counted[part] = some.counts() > 0
+        return counted
+
+    def _blocks(self) -> Iterator[tuple[slice, Observed]]:
+        """Some texels at a time: counts of all are eight times as large as what they count."""
         for first in range(0, len(self.views), TEXELS_COUNTED):
-            part = slice(first, first + TEXELS_COUNTED)
-            some = Observed(self.views[part], self.lights[part], self.pairs)
-            total += float((some.views_under_lights() * some.lights).sum(dtype=np.float64))
-        return int(total)
+            texels = slice(first, first + TEXELS_COUNTED)
+            yield texels, self.part(texels)
 
 
 @dataclass(frozen=True, eq=False)

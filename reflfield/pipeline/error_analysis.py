@@ -125,7 +125,6 @@ def mean_cosines(context: Context) -> NDArray[np.float64]:
     if not training.lights_known:
         return np.ones((len(texels), 3))
     observed = results.observed(context)
-    counts = observed.views_under_lights().astype(np.float64)
     means = np.zeros((len(texels), 3))
     step = max(1, PAIRS_AT_ONCE // training.n_lights)
     for first in range(0, len(texels), step):
@@ -133,7 +132,7 @@ def mean_cosines(context: Context) -> NDArray[np.float64]:
         _, lights = directions_of(training, texels.position[part])
         cosines = softened_cosine(np.einsum("nld,nd->nl", lights, texels.normal[part]))
         shining = facing_irradiance(training.lights, texels.position[part]) > 0
-        weights = counts[part] * observed.lights[part]
+        weights = observed.part(part).counts()
         of_channel = weights[..., None] * shining
         total = np.einsum("nlc,nl->nc", of_channel, cosines)
         means[part] = total / np.maximum(of_channel.sum(axis=1), 1.0)

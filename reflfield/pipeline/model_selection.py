@@ -131,7 +131,7 @@ def _supports_half_vector(context: Context, visibility: str) -> bool:
     wants_clusters = asked.comparison.without_alignment or asked.compression.fit != AUTO
     if visibility == "kept" or not context.casts_shadows or wants_clusters:
         return False
-    n = samples_per_texel(_with_visibility(context, visibility))
+    n = _samples_with(context, visibility)
     return least_samples(context) <= n <= MOST_SAMPLES
 
 
@@ -165,6 +165,16 @@ def _with_visibility(context: Context, visibility: str) -> Context:
     return replace(context, options=options)
 
 
+def _samples_with(context: Context, visibility: str) -> float:
+    """Samples per texel with shadows treated in a way, counted once."""
+    record = context.stages.record(context.stage_of("visibility"))
+    return context.cache.get(
+        f"samples per texel, shadows {visibility}",
+        ("" if record is None else record.key,),
+        lambda: samples_per_texel(_with_visibility(context, visibility)),
+    )
+
+
 def _visibilities(context: Context) -> tuple[str, ...]:
     asked = context.asked_options.resampling.visibility
     if asked != AUTO:
@@ -182,7 +192,7 @@ def _fits(context: Context, visibility: str, model: str) -> tuple[str, ...]:
     options = context.asked_options.compression
     if options.fit != AUTO or model == HALF_VECTOR:
         return (options.fit,)
-    n = samples_per_texel(_with_visibility(context, visibility))
+    n = _samples_with(context, visibility)
     fits = ("samples", "grid") if options.fits_samples(n) else ("grid", "samples")
     compared = len(context.held_out.photographs) > 0 and can_fit_samples(context, n)
     # Of one view all frames are known, and with them the fit to enough samples is the better.

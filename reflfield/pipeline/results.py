@@ -136,15 +136,14 @@ def observed(context: Context) -> Observed:
     """Which samples count: seen by the camera, and lit where shadows are factored out."""
     lights = light_visible(context)
     if context.visibility_kind != "factored":
-        lights = np.ones_like(lights)
+        lights = np.broadcast_to(np.True_, lights.shape)
     return Observed(view_visible(context), lights, PhotographedPairs.of(context.training))
 
 
 @cached("visibility")
 def sampled(context: Context) -> Bools:
     """(n_texels, n_lights) True where a camera sees the texel under a light that counts."""
-    of_texels = observed(context)
-    return np.asarray(of_texels.views_under_lights() * of_texels.lights > 0)
+    return observed(context).counted()
 
 
 def samples_location(context: Context) -> Location:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
 from reflfield.pipeline import comparison, results
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.context import Context
@@ -53,11 +51,11 @@ def _photographs(context: Context, projected: dict[str, Any]) -> CountedItems:
 def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItems:
     """One sample for each texel and photograph: fitted, unseen, shadowed, below the horizon."""
     observed = results.observed(context)
-    seen = observed.views_under_lights()
-    shadowed = np.sum(seen * ~observed.lights, dtype=np.float64)
-    unseen = seen.shape[0] * len(observed.pairs) - np.sum(seen, dtype=np.float64)
+    n_seen, n_observed = observed.count_seen(), observed.count()
+    shadowed = n_seen - n_observed
+    unseen = len(observed.views) * len(observed.pairs) - n_seen
     # As the completion counted them, where there is one.
-    handed_on = counts.get("completion", {}).get("samples observed", observed.count())
+    handed_on = counts.get("completion", {}).get("samples observed", n_observed)
     used = counts["compression"]["samples fitted"]
     unmeasured = counts["compression"]["samples not measured"]
     shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
@@ -69,10 +67,10 @@ def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItem
         len(results.texels(context)) * len(context.training.photographs),
         {
             "fitted": used,
-            "texel not seen by the camera": int(unseen),
+            "texel not seen by the camera": unseen,
             "in shadow: fitted as indirect light": shown,
             "in shadow: at its edge": mixed,
-            "in shadow: nothing made of them": int(shadowed) - shown - mixed,
+            "in shadow: nothing made of them": shadowed - shown - mixed,
             "not measured in any channel": unmeasured,
             "below the horizon of the texel's frame, or outside the light's cone": (
                 handed_on - used - unmeasured

@@ -14,7 +14,12 @@ from scipy.spatial import cKDTree
 from reflfield.errors import InputError
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.completion_error import CompletionError, completion_error
-from reflfield.metrics.frame_errors import FrameErrors, frame_errors, surface_points
+from reflfield.metrics.frame_errors import (
+    FrameErrors,
+    frame_errors,
+    surface_points,
+    true_frames,
+)
 from reflfield.metrics.hull_distance import HullDistance, hull_distance
 from reflfield.metrics.truth_files import Truth, open_truth
 from reflfield.observations.frame_resampling import apply_both
@@ -120,11 +125,11 @@ def frame_scores(
     target = np.zeros(len(seen), np.int32)
     if context.options.aligns:
         target = results.arrays(context, "alignment", "alignment.npz")["cluster"][seen]
+    true = true_frames(position, surface, reach)
+    base = results.texels(context).local_from_world[seen]
     return (
-        frame_errors(position, field.local_from_world[seen], surface, reach, target),
-        frame_errors(
-            position, results.texels(context).local_from_world[seen], surface, reach, 0 * target
-        ),
+        frame_errors(true, field.local_from_world[seen], target),
+        frame_errors(true, base, 0 * target),
     )
 
 

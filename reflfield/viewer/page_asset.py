@@ -31,6 +31,8 @@ PREVIEW_SIDE = 256
 # Steps of the table of indirect light from 0 to the largest value of a function.
 TABLE_STEPS = 511
 PREVIEW_PERCENTILE = 99.0
+# Level 9 takes seven times as long for a page that is 4 % smaller (a plate of 800 x 800).
+PACKING_LEVEL = 6
 # Of the distances between hull and surface, that full colour stands for, and codes up to it.
 MOVED_PERCENTILE, MOVED_STEPS = 95.0, 127
 
@@ -132,7 +134,7 @@ def packed_block(arrays: Mapping[str, NDArray[Any]]) -> PackedBlock:
         entries.append({**entry, **way, "start": start})
         parts.append(content)
         start += len(content)
-    return PackedBlock(zlib.compress(b"".join(parts), 9), tuple(entries), start)
+    return PackedBlock(zlib.compress(b"".join(parts), PACKING_LEVEL), tuple(entries), start)
 
 
 def _packings(array: NDArray[Any]) -> Iterator[tuple[bytes, dict[str, Any]]]:

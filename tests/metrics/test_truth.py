@@ -17,6 +17,7 @@ from reflfield.metrics.frame_errors import (
     angle_deg,
     frame_errors,
     surface_points,
+    true_frames,
 )
 from reflfield.metrics.hull_distance import hull_distance
 from reflfield.metrics.truth_files import TruthView, open_truth
@@ -109,8 +110,8 @@ def test_planted_tilts_and_turns_are_found(surface, degrees, rng):
     tilt, turn = (
         Rotation.from_rotvec(np.radians(degrees) * a).as_matrix() for a in np.eye(3)[[0, 2]]
     )
-    tilted = frame_errors(points.position, tilt @ frames, points, 1e-9)
-    turned = frame_errors(points.position, turn @ frames, points, 1e-9)
+    tilted = frame_errors(true_frames(points.position, points, 1e-9), tilt @ frames)
+    turned = frame_errors(true_frames(points.position, points, 1e-9), turn @ frames)
     tolerance = 1e-9  # degrees; arctan2 of unit vectors is good to about 1e-13
     assert np.allclose(tilted.normal, degrees, atol=tolerance)
     assert np.allclose(tilted.tangent, 0, atol=tolerance)
@@ -136,7 +137,7 @@ def test_frames_between_points_are_interpolated_to_second_order(rng):
         at, along = ball(count, rng)
         along *= rng.choice([-1.0, 1.0], (count, 1))  # tangents are lines
         points = SurfacePoints(at, at, along, np.zeros(count, int))
-        errors = frame_errors(normal, frames, points, 0.1)
+        errors = frame_errors(true_frames(normal, points, 0.1), frames)
         worst.append(max(np.median(errors.normal), np.median(errors.tangent)))
     # Spacing 1 / 64 rad at 16,000 points: the nearest point alone is 0.4 degrees off.
     assert worst[1] < 0.02
@@ -150,14 +151,14 @@ def test_materials_are_not_mixed(rng):
     label = (at[:, 0] > 0).astype(int)
     points = SurfacePoints(at, np.tile([0, 0, 1.0], (4_000, 1)), np.eye(3)[label], label)
     expected = np.array([np.eye(3), np.eye(3)[[1, 0, 2]] * [[1], [-1], [1]]])[label]
-    errors = frame_errors(at, expected, points, 0.01)
+    errors = frame_errors(true_frames(at, points, 0.01), expected)
     assert errors.tangent.max() < 1e-9
 
 
 def test_tangents_are_lines(surface):
     points, frames = surface
     half_turn = np.diag([-1.0, -1.0, 1.0])
-    errors = frame_errors(points.position, half_turn @ frames, points, 1e-9)
+    errors = frame_errors(true_frames(points.position, points, 1e-9), half_turn @ frames)
     assert np.allclose(errors.tangent, 0, atol=1e-9)
 
 
@@ -177,7 +178,7 @@ def test_one_turn_is_removed_for_each_target_and_material(rng):
     planted = np.array([[-80.0, 30.0], [0.0, 89.0], [45.0, -45.0]])
     noise = rng.normal(0, 4.0, n) + 180.0 * rng.integers(0, 2, n)
     recovered = turned_about_normals(frames, planted[target, label] + noise)
-    errors = frame_errors(position, recovered, points, 1e-9, target)
+    errors = frame_errors(true_frames(position, points, 1e-9), recovered, target)
     assert {(t.target, t.label) for t in errors.rotations} == set(np.ndindex(3, 2))
     for turn in errors.rotations:
         # The mean of about 500 turns of 4 degrees: 0.18; five times that.
@@ -189,7 +190,7 @@ def test_one_turn_is_removed_for_each_target_and_material(rng):
     # Where no neighbour of the material lies near, the true frame is the point's own.
     assert np.median(errors.normal) < 1e-6
     # Without targets nothing is removed.
-    assert frame_errors(position, recovered, points, 1e-9).tangent.mean() > 30
+    assert frame_errors(true_frames(position, points, 1e-9), recovered).tangent.mean() > 30
 
 
 def test_tilt_does_not_bias_the_turn(rng):
@@ -201,7 +202,9 @@ def test_tilt_does_not_bias_the_turn(rng):
     tilted = Rotation.from_rotvec(tilt).as_matrix() @ turned_about_normals(
         frames, np.full(n, 20.0)
     )
-    (turn,) = frame_errors(points.position, tilted, points, 1e-9, np.zeros(n, int)).rotations
+    (turn,) = frame_errors(
+        true_frames(points.position, points, 1e-9), tilted, np.zeros(n, int)
+    ).rotations
     # A tilt of 8 degrees moves single tangents by up to half a degree about the normal.
     assert turn.degrees == pytest.approx(20.0, abs=0.05)
 
@@ -212,7 +215,7 @@ def test_random_tangents_stay_random(rng):
     position = rng.normal(size=(n, 3))
     points = SurfacePoints(position, frames[:, 2], frames[:, 0], np.zeros(n, int))
     recovered = turned_about_normals(frames, rng.uniform(0, 180, n))
-    errors = frame_errors(position, recovered, points, 1e-9, np.zeros(n, int))
+    errors = frame_errors(true_frames(position, points, 1e-9), recovered, np.zeros(n, int))
     # Uniform from 0 to 90: mean 45, its scatter .37; the turn removed gains as much.
     assert errors.tangent.mean() == pytest.approx(45.0, abs=1.5)
 
@@ -220,7 +223,7 @@ def test_random_tangents_stay_random(rng):
 def test_targets_of_other_texels_are_refused(surface):
     points, frames = surface
     with pytest.raises(ShapeError, match="targets"):
-        frame_errors(points.position, frames, points, 1e-9, np.zeros(3, int))
+        frame_errors(true_frames(points.position, points, 1e-9), frames, np.zeros(3, int))
 
 
 def test_world_frame_does_not_matter(surface, rng):
@@ -230,8 +233,8 @@ def test_world_frame_does_not_matter(surface, rng):
     moved = SurfacePoints(
         *(v @ world.T for v in (points.position, points.normal, points.tangent)), points.label
     )
-    before = frame_errors(points.position, noisy, points, 1e-6)
-    after = frame_errors(points.position @ world.T, noisy @ world.T, moved, 1e-6)
+    before = frame_errors(true_frames(points.position, points, 1e-6), noisy)
+    after = frame_errors(true_frames(points.position @ world.T, moved, 1e-6), noisy @ world.T)
     assert np.allclose(before.normal, after.normal, atol=1e-9)
     assert np.allclose(before.tangent, after.tangent, atol=1e-9)
 
@@ -241,7 +244,7 @@ def test_far_texels_and_broken_frames_are_left_out(surface):
     positions, broken = points.position.copy(), frames.copy()
     positions[3] *= 2
     broken[5] = np.nan
-    errors = frame_errors(positions, broken, points, 0.01)
+    errors = frame_errors(true_frames(positions, points, 0.01), broken)
     assert np.array_equal(errors.texel, np.setdiff1d(np.arange(500), [3, 5]))
     assert errors.summary()["n_texels"] == 498
 
@@ -249,7 +252,7 @@ def test_far_texels_and_broken_frames_are_left_out(surface):
 @pytest.mark.stability
 def test_nothing_to_match_is_defined():
     empty = surface_points([])
-    errors = frame_errors(np.zeros((2, 3)), np.stack([np.eye(3)] * 2), empty, 1.0)
+    errors = frame_errors(true_frames(np.zeros((2, 3)), empty, 1.0), np.stack([np.eye(3)] * 2))
     assert errors.summary()["n_texels"] == 0
     assert math.isnan(errors.summary()["normal_mean_deg"])
 
