@@ -10,16 +10,24 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.encoding import encode_srgb
 from reflfield.errors import InputError
 
 Array = NDArray[np.float64]
 
 # Colours of the patches of charts made since November 2014, under D50.
 CHART = "ColorChecker24 - After November 2014"
-N_PATCHES, NEUTRAL = 24, slice(18, 24)
+ROWS, COLUMNS = 4, 6
+N_PATCHES, NEUTRAL = ROWS * COLUMNS, slice(18, 24)
+# Share of a patch's side that is sampled, with so many samples a side: frames between patches
+# are a tenth of it, and the chart is found to a few hundredths.
+SAMPLED_SIDE, SAMPLES_PER_SIDE = 0.5, 12
+# Charts that are told apart in a photograph; more than one is refused.
+MOST_CHARTS = 4
 # Share of the largest value of the photograph from which on a patch may be clipped, and patches
 # and grey ones that tell a matrix.
 CLIPPED, FEWEST_PATCHES, FEWEST_GREYS = 0.95, 12, 2
@@ -30,7 +38,6 @@ _WORDS = {
     "white balance": "the white balance alone, no matrix is better",
     "none": "nothing, no correction is better",
 }
-_NEEDED = ("colour", "colour_checker_detection")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +112,7 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
     Raises
     ------
     InputError
-        If colour-science or colour-checker-detection are not installed, no chart is found, or
-        too much of it is clipped.
+        If colour-science is not installed, no chart is found, or too much of it is clipped.
 
     Notes
     -----
@@ -119,8 +125,8 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
     """
     check_installed()
     image = np.asarray(photograph, np.float64)
-    with _libraries() as (colour, detection):
-        patches = _patches(detection, image / max(float(image.max()), 1e-9), name)
+    patches = _patches(image / max(float(image.max()), 1e-9), name)
+    with _library() as colour:
         truth = _reference(colour)
         used: NDArray[np.bool_] = np.all((patches < CLIPPED) & (patches > 0), axis=1)
         greys = np.zeros(N_PATCHES, bool)
@@ -136,45 +142,68 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
 
 
 def check_installed() -> None:
-    """Demand the packages of the extra ``color``.
+    """Demand the package of the extra ``color``.
 
     Raises
     ------
     InputError
     """
-    missing = [name.replace("_", "-") for name in _NEEDED if not find_spec(name)]
-    if missing:
+    if not find_spec("colour"):
         raise InputError(
-            f"color_checker: expected the packages that find a chart, found no "
-            f'{", ".join(missing)}; install them with: pip install "reflfield[color]"'
+            "color_checker: expected the package that knows the colours of a chart, found no "
+            'colour-science; install it with: pip install "reflfield[color]"'
         )
 
 
 @contextmanager
-def _libraries() -> Iterator[tuple[Any, Any]]:
-    """The packages, imported when they are used; what they lack themselves is not warned of.
+def _library() -> Iterator[Any]:
+    """colour-science, imported when it is used; what it lacks itself is not warned of.
 
-    One of them changes how NumPy prints arrays: that is undone.
+    It changes how NumPy prints arrays: that is undone.
     """
     with warnings.catch_warnings(), np.printoptions():
         warnings.simplefilter("ignore")
-        yield import_module("colour"), import_module("colour_checker_detection")
+        yield import_module("colour")
 
 
-def _patches(detection: Any, image: Array, name: str) -> Array:
+def _patches(image: Array, name: str) -> Array:
     """Linear colours (24, 3) of the chart's patches, of a photograph in [0, 1]."""
-    charts = detection.detect_colour_checkers_segmentation(image.astype(np.float32))
-    if len(charts) == 0:
-        # Its edges are sought in what is as bright as on a screen.
-        shown = np.clip(image, 0, 1) ** (1 / 2.2)
-        charts = detection.detect_colour_checkers_segmentation(shown.astype(np.float32))
-        charts = [np.asarray(chart, np.float64) ** 2.2 for chart in charts]
-    if len(charts) != 1 or np.shape(charts[0]) != (N_PATCHES, 3):
+    # Its edges are sought in what is as bright as on a screen, then in what is linear.
+    charts = _corners(np.asarray(encode_srgb(np.clip(image, 0, 1))))
+    charts = charts or _corners(np.clip(image, 0, 1))
+    if len(charts) != 1:
         raise InputError(
             f"{name}: expected one ColorChecker Classic of {N_PATCHES} patches, found "
             f"{len(charts)}; choose a photograph in which it is large, sharp and evenly lit"
         )
-    return np.asarray(charts[0], np.float64)
+    return _sampled(image, charts[0])
+
+
+def _corners(shown: Array) -> list[NDArray[np.float32]]:
+    """Corners (4, 2) of the charts in a picture in [0, 1], from that of the first patch on."""
+    detector = cv2.mcc.CCheckerDetector.create()
+    picture = np.ascontiguousarray(np.rint(shown[..., ::-1] * 255).astype(np.uint8))
+    sought: tuple[Any, ...] = (picture, cv2.mcc.MCC24, MOST_CHARTS)
+    if hasattr(detector, "setColorChartType"):  # since OpenCV 5
+        detector.setColorChartType(cv2.mcc.MCC24)
+        sought = (picture, MOST_CHARTS)
+    charts = detector.getListColorChecker() if detector.process(*sought) else ()
+    return [np.asarray(chart.getBox(), np.float32).reshape(4, 2) for chart in charts]
+
+
+def _sampled(image: Array, corners: NDArray[np.float32]) -> Array:
+    """Mean colours (24, 3) of the middles of the patches between four corners."""
+    chart = np.array([[0, 0], [COLUMNS, 0], [COLUMNS, ROWS], [0, ROWS]], np.float32)
+    image_from_chart = cv2.getPerspectiveTransform(chart, corners)
+    steps = 0.5 + SAMPLED_SIDE * ((np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE - 0.5)
+    x = (np.arange(COLUMNS)[:, None] + steps).ravel()
+    y = (np.arange(ROWS)[:, None] + steps).ravel()
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    in_image = cv2.perspectiveTransform(places, image_from_chart).reshape(len(y), len(x), 2)
+    u, v = np.moveaxis(in_image.astype(np.float32), 2, 0)
+    values = cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR)
+    sides = (ROWS, SAMPLES_PER_SIDE, COLUMNS, SAMPLES_PER_SIDE, 3)
+    return values.reshape(sides).mean(axis=(1, 3)).reshape(N_PATCHES, 3).astype(np.float64)
 
 
 def _reference(colour: Any) -> Array:

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from importlib.util import find_spec
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -24,14 +25,14 @@ CAMERA_FROM_LINEAR = np.array([[0.40, 0.12, 0.03], [0.06, 0.55, 0.09], [0.02, 0.
 
 def needs_the_extra():
     """Skip without it; not by an import, which would change how NumPy prints."""
-    if find_spec("colour_checker_detection") is None:
+    if find_spec("colour") is None:
         pytest.skip("needs the extra color")
 
 
-def test_numpy_prints_as_before_after_the_libraries_were_used():
-    """One of them switches NumPy to how it printed arrays in 2017."""
+def test_numpy_prints_as_before_after_the_library_was_used():
+    """It switches NumPy to how it printed arrays in 2017."""
     needs_the_extra()
-    with color_chart._libraries():
+    with color_chart._library():
         pass
     assert repr(np.array([1.0, 2.0])) == "array([1., 2.])"
     assert np.get_printoptions()["legacy"] is False
@@ -41,7 +42,7 @@ def test_numpy_prints_as_before_after_the_libraries_were_used():
 def chart_photograph():
     """Function that draws the chart as a camera sees it, linear."""
     needs_the_extra()
-    with color_chart._libraries() as (colour, _):
+    with color_chart._library() as colour:
         colors = color_chart._reference(colour)
 
     def draw(camera_from_linear, exposure=1.0):
@@ -67,6 +68,30 @@ def test_matrix_of_the_camera_is_inverted(chart_photograph):
     total = correction.matrix @ CAMERA_FROM_LINEAR
     np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=0.03)
     assert correction.error_after < 1 < correction.error_balanced < correction.error_before
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_chart_that_lies_turned_and_aslant_gives_the_same(chart_photograph, quarters):
+    upright = chart_photograph(CAMERA_FROM_LINEAR)
+    height, width = upright.shape[:2]
+    corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
+    aslant = corners + np.float32([[60, 20], [-30, 50], [-10, -60], [20, -10]])
+    moved = cv2.warpPerspective(
+        upright,
+        cv2.getPerspectiveTransform(corners, aslant),
+        (width, height),
+        flags=cv2.INTER_LINEAR,
+        borderValue=(0.25, 0.25, 0.25),
+    )
+    turned = color_chart._patches(np.ascontiguousarray(np.rot90(moved, quarters)), "turned")
+    # Means of evenly coloured patches: single precision and OpenCV's 5 bits between pixels.
+    np.testing.assert_allclose(turned, color_chart._patches(upright, "upright"), atol=1e-5)
+
+
+def test_two_charts_are_refused(chart_photograph):
+    two = np.concatenate([chart_photograph(CAMERA_FROM_LINEAR)] * 2)
+    with pytest.raises(InputError, match=r"expected one ColorChecker .* found 2"):
+        color_chart._patches(two, "two.exr")
 
 
 def test_clipped_patches_are_left_out(chart_photograph):
