@@ -33,6 +33,7 @@ from reflfield.capture.documents import (
 from reflfield.capture.encoding import read_pairs
 from reflfield.capture.image_files import AS_STATED, ImageReading, image_size
 from reflfield.capture.lights import Light
+from reflfield.capture.paths import usable_path
 from reflfield.capture.transforms_camera import OPENCV_FROM_OPENGL
 from reflfield.capture.view_folders import IMAGES, ViewFolders, view_folders
 from reflfield.errors import CaptureError, InputError
@@ -121,7 +122,8 @@ def _read_line(line: str, content: _ViewSet, description: Path) -> None:
     elif key == "v":
         content.views.append(_view_line(line, description))
     elif key == "i":
-        content.folder = Path(line.split(maxsplit=1)[-1].strip().replace("\\", "/")).name
+        folder = usable_path(line.split(maxsplit=1)[-1].strip(), description)
+        content.folder = Path(folder.replace("\\", "/")).name
     elif key == "e":
         content.n_pairs += 1
     elif key not in _WITHOUT_EFFECT:

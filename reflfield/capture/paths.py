@@ -137,11 +137,7 @@ class NamedFiles:
 
     def _names(self, text: object) -> list[str]:
         r"""The text, and where it has ``\`` as Windows reads it."""
-        if not isinstance(text, str) or not _usable(text):
-            raise CaptureError(
-                f"{self.description}: expected a path without control characters, of at most "
-                f"{LONGEST_PATH} bytes; {quoted(text)} is not a usable path"
-            )
+        text = usable_path(text, self.description)
         return [text, text.replace("\\", "/")] if "\\" in text else [text]
 
     def _check_inside(self, name: str) -> None:
@@ -194,6 +190,22 @@ class NamedFiles:
                 listing.setdefault(_key(name), []).append(name)
             self._listings[folder] = listing
         return self._listings[folder]
+
+
+def usable_path(text: object, description: Path) -> str:
+    """A text of a description that can be a path; whether there is such a file or not.
+
+    Raises
+    ------
+    CaptureError
+        If it is no text, is empty or too long, or holds control characters.
+    """
+    if not isinstance(text, str) or not _usable(text):
+        raise CaptureError(
+            f"{description}: expected a path without control characters, of at most "
+            f"{LONGEST_PATH} bytes; {quoted(text)} is not a usable path"
+        )
+    return text
 
 
 def _usable(text: str) -> bool:

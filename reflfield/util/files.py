@@ -14,6 +14,7 @@ import re
 import shutil
 import stat
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -261,7 +262,10 @@ def _array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     }.get(version)
     if read is None:
         raise ValueError(f"version {version} of the npy format")
-    shape, _, dtype = read(file, max_header_size=LONGEST_ARRAY_HEADER)
+    try:
+        shape, _, dtype = read(file, max_header_size=LONGEST_ARRAY_HEADER)
+    except tokenize.TokenError as failure:  # no error that callers expect of a file
+        raise ValueError(f"header: {failure}") from failure
     if dtype.hasobject:
         raise ValueError("pickled objects, which are never read")
     return shape, dtype

@@ -253,6 +253,7 @@ def test_view_set_encoding(flashes):
         (lambda t: t.replace("\nP ", "\nP 3 ", 1), "a rotation and a translation"),
         (lambda t: t.replace("shot 2.png", "../../shot 2.png"), "leaves it"),
         (lambda t: t.replace("i previews", "i ../../elsewhere"), "photographs in a folder"),
+        (lambda t: t.replace("i previews", f"i {'p' * 300}"), "not a usable path"),
         (lambda t: t + "e 0.5 200\n", "2 to 65536 pairs"),
         (lambda t: t + "e 0.5 200\ne 0.6 100\n", "increase"),
     ],

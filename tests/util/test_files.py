@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from reflfield.errors import CaptureError, InputError
-from reflfield.util.files import check_regular, filling, load_arrays, read_bytes, replacing
+from reflfield.util.files import (
+    check_regular,
+    filling,
+    load_array,
+    load_arrays,
+    read_bytes,
+    replacing,
+)
 
 MOST = 1 << 20
 
@@ -60,6 +67,14 @@ def test_header_that_claims_terabytes_is_refused(tmp_path):
         archive.writestr("a.npy", content)
     with pytest.raises(InputError, match="claims 8,796,093,022,208 bytes"):
         load_arrays(tmp_path / "x.npz", MOST)
+
+
+def test_a_header_that_is_no_python_is_refused(tmp_path):
+    np.save(tmp_path / "x.npy", np.zeros(3))
+    whole = (tmp_path / "x.npy").read_bytes()
+    (tmp_path / "x.npy").write_bytes(whole.replace(b"}", b" "))
+    with pytest.raises(InputError, match=r"x\.npy: expected an array in an npy file"):
+        load_array(tmp_path / "x.npy", MOST)
 
 
 def test_array_that_inflates_is_refused(tmp_path):
