@@ -250,7 +250,7 @@ def _pixels(
         top = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
         pixels = (top - pixels).astype(pixels.dtype)
     if header.kind == "hdr":
-        pixels = pixels * np.float32(radiance_scale(header))
+        pixels = pixels * np.array(radiance_scale(header), np.float32)
     return pixels
 
 

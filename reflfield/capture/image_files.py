@@ -263,6 +263,11 @@ def image_orientation(path: Path | str) -> int:
     return read_header(Path(path)).orientation
 
 
+def stated_exposure(path: Path | str) -> tuple[float, float, float]:
+    """Seconds, f-number and ISO of a photograph by its Exif data, 0 where they do not say."""
+    return read_header(Path(path)).exposure
+
+
 def _read(path: Path, reading: ImageReading) -> StoredImage:
     header = read_header(path)
     return decode_stored(path, header, choose_layer(path, header, reading.layer))

@@ -18,10 +18,12 @@ from typing import IO
 
 from reflfield.capture.exr_headers import ExrPart, read_exr_parts
 from reflfield.capture.tiff_headers import (
+    ExifFacts,
     TiffPage,
     exif_facts,
     raw_evidence,
     read_tiff_pages,
+    tiff_facts,
 )
 from reflfield.errors import CaptureError
 from reflfield.util.files import check_regular
@@ -92,6 +94,8 @@ class ImageHeader:
         Pixels as stored; of an EXR the display window, of several parts or pages the first.
     orientation : int
         How a viewer would turn the image (Exif, 1 to 8); the pixels stay as they are.
+    exposure : (seconds, f-number, ISO) tuple of float
+        As Exif data say; 0 where they do not.
     alpha : bool
         Of a PNG or TIFF: whether there is an alpha channel.
     adobe_rgb : bool
@@ -110,6 +114,7 @@ class ImageHeader:
     width: int
     height: int
     orientation: int = 1
+    exposure: tuple[float, float, float] = (0.0, 0.0, 0.0)
     alpha: bool = False
     adobe_rgb: bool = False
     chunks: dict[bytes, bytes] = field(default_factory=dict)
@@ -186,7 +191,11 @@ def _raw_header(path: Path, start: bytes) -> ImageHeader | None:
         kind = path.suffix[1:].upper()
     elif start[:4] in (b"II*\0", b"MM\0*"):
         kind = raw_evidence(path)
-    return ImageHeader("raw", 0, 0, raw=kind) if kind else None
+    if not kind:
+        return None
+    with path.open("rb") as file:
+        facts = tiff_facts(path, file) if start[:2] in (b"II", b"MM") else ExifFacts()
+    return ImageHeader("raw", 0, 0, exposure=facts.exposure, raw=kind)
 
 
 def _reader_of(path: Path, start: bytes) -> Callable[[Path, IO[bytes]], ImageHeader]:
@@ -234,8 +243,9 @@ def _tiff(path: Path, file: IO[bytes]) -> ImageHeader:
     for page in pages:
         check_size(path, page.tile_width, page.tile_height, MAX_PIXELS)
     first = next((page for page in pages if not page.reduced), pages[0])
+    exposure = tiff_facts(path, file).exposure
     return ImageHeader(
-        "tiff", first.width, first.height, first.orientation, first.alpha, pages=pages
+        "tiff", first.width, first.height, first.orientation, exposure, first.alpha, pages=pages
     )
 
 
@@ -250,10 +260,12 @@ def _png(path: Path, file: IO[bytes]) -> ImageHeader:
         chunks[name] = file.read(kept)
         file.seek(length - kept + 4, os.SEEK_CUR)  # and the checksum
     width, height = struct.unpack(">II", chunks.get(b"IHDR", b"")[:8])
-    orientation, _ = exif_facts(path, chunks.get(b"eXIf", b""))
+    exif = exif_facts(path, chunks.get(b"eXIf", b""))
     colour_type = chunks[b"IHDR"][9]
     alpha = colour_type in (4, 6) or b"tRNS" in chunks
-    return ImageHeader("png", width, height, orientation, alpha, chunks=chunks)
+    return ImageHeader(
+        "png", width, height, exif.orientation, exif.exposure, alpha, chunks=chunks
+    )
 
 
 def check_png(path: Path) -> None:
@@ -284,7 +296,7 @@ def check_png(path: Path) -> None:
 def _jpeg(path: Path, file: IO[bytes]) -> ImageHeader:
     """Width and height stand in the frame segment, behind others of any length."""
     file.seek(2)
-    orientation, adobe_rgb = 1, False
+    exif = ExifFacts()
     for _ in range(MOST_JPEG_SEGMENTS):
         fill, marker = struct.unpack("BB", file.read(2))
         while marker == 0xFF:  # fill bytes
@@ -301,10 +313,12 @@ def _jpeg(path: Path, file: IO[bytes]) -> ImageHeader:
                     f"{path}: expected a JPEG of 8 bits, grey or RGB, received {precision} "
                     f"bits and {channels} channels; export it again"
                 )
-            return ImageHeader("jpeg", width, height, orientation, adobe_rgb=adobe_rgb)
+            return ImageHeader(
+                "jpeg", width, height, exif.orientation, exif.exposure, adobe_rgb=exif.adobe_rgb
+            )
         content = file.read(length - 2) if marker == 0xE1 else b""
         if content[:6] == b"Exif\0\0":
-            orientation, adobe_rgb = exif_facts(path, content[6:])
+            exif = exif_facts(path, content[6:])
         file.seek(length - 2 - len(content), os.SEEK_CUR)
     raise CaptureError(
         f"{path}: expected a JPEG image, received one without a frame; is it whole?"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.capture.capture import Capture
-from reflfield.capture.image_files import largest_code_of_16
+from reflfield.capture.image_files import largest_code_of_16, stated_exposure
 from reflfield.capture.inspect import object_centre, spread_evenly
 from reflfield.capture.lights import POINT, SPOT
-from reflfield.errors import CaptureError
+from reflfield.errors import CaptureError, InputError
 from reflfield.util.quoting import listed
 
 # 16-bit files that hold sensors' codes as they are have at most 12 bits set, one in sixteen of
@@ -21,6 +23,10 @@ FOURTEEN_BITS = 16383
 _MOST_LOOKED_INTO = 8
 # A dome's lamps stand about as far from the object as its cameras.
 FARTHEST_LIGHTS = 100.0
+# Exposures of cameras are a third of a stop apart (1.26), and rounded (1/30 for 1/32).
+SAME_EXPOSURE = 1.12
+# Larger seconds, f-numbers and speeds are damaged data.
+MOST_STATED = 1e8
 # Pixels of today's sensors are square.
 LARGEST_ASPECT = 1.5
 
@@ -114,3 +120,49 @@ def stray_principal_points(capture: Capture) -> tuple[str, ...]:
         f"{listed([camera.id for camera in stray])} ({first.cx:.6g}, {first.cy:.6g} of "
         f"{first.width} x {first.height} pixels); are photographs reduced or cropped?",
     )
+
+
+def differing_exposures(capture: Capture) -> tuple[str, ...]:
+    """A note on photographs that were exposed differently, as their Exif data say.
+
+    Exposure times that the description states are taken off. Photographs that cannot be read
+    are left out.
+    """
+    light: dict[tuple[bool, ...], list[tuple[float, Path, tuple[float, ...]]]] = {}
+    for photograph in capture.photographs:
+        for exposure in photograph.exposures:
+            stated = _exposure_of(exposure.path)
+            known = tuple(value > 0 for value in stated)
+            seconds, stop, speed = (value or 1.0 for value in stated)
+            amount = seconds * speed / stop**2 / exposure.seconds
+            light.setdefault(known, []).append((amount, exposure.path, stated))
+    notes = []
+    for known, entries in light.items():
+        usual = float(np.median([amount for amount, _, _ in entries]))
+        most, least = max(entries), min(entries)
+        if any(known) and most[0] > SAME_EXPOSURE * least[0]:
+            ratios = [amount / usual for amount, _, _ in entries]
+            other = sum(not 1 / SAME_EXPOSURE < ratio < SAME_EXPOSURE for ratio in ratios)
+            notes.append(
+                f"{most[1]}: exposed {most[0] / least[0]:.3g} times as much as "
+                f"{least[1].name}, as their Exif data say ({_settings(most[2])}; "
+                f"{_settings(least[2])}; {other} of {len(entries)} files differ from the "
+                "others), beside what the description says; were they brought to one exposure? "
+                "Else give 'exposures' with seconds in capture.json, or intensities of lights "
+                "that make up for it"
+            )
+    return tuple(notes)
+
+
+def _exposure_of(path: Path) -> tuple[float, ...]:
+    """Seconds, f-number and ISO; 0 where they are not stated, or no camera's."""
+    try:
+        stated = stated_exposure(path)
+    except InputError:
+        return (0.0, 0.0, 0.0)
+    return tuple(value if 0 < value < MOST_STATED else 0.0 for value in stated)
+
+
+def _settings(stated: tuple[float, ...]) -> str:
+    words = ("{:.4g} s", "f/{:.3g}", "ISO {:.6g}")
+    return ", ".join(w.format(v) for w, v in zip(words, stated, strict=True) if v > 0)

@@ -25,6 +25,7 @@ from reflfield.capture.image_files import AS_STATED, ImageReading
 from reflfield.capture.light_table import light_table_of, with_lights
 from reflfield.capture.plausibility import (
     check_code_range,
+    differing_exposures,
     far_lights,
     oblong_pixels,
     stray_principal_points,
@@ -104,6 +105,7 @@ def open_capture(
         check_photographs(capture)
         more = (
             *check_code_range(capture),
+            *differing_exposures(capture),
             *unphotographed(capture),
             *far_lights(capture),
             *oblong_pixels(capture),

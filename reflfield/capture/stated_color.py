@@ -91,14 +91,21 @@ def stated_space(
         ) from error
 
 
-def radiance_scale(header: ImageHeader) -> float:
-    """Radiance of the stored value 1: the reciprocal of a Radiance file's exposures."""
-    exposure = 1.0
+def radiance_scale(header: ImageHeader) -> tuple[float, ...]:
+    """Radiance of the stored value 1 in red, green and blue of a Radiance file.
+
+    The reciprocal of the exposures and colour corrections that it says were applied.
+    """
+    applied = [1.0, 1.0, 1.0]
     for line in header.lines:
         name, _, value = line.partition("=")
-        if name == "EXPOSURE":
-            exposure *= _number(value)
-    return 1.0 / exposure if exposure > 0 else math.nan
+        if name in ("EXPOSURE", "COLORCORR"):
+            factors = [_number(word) for word in value.split()]
+            factors = factors * 3 if name == "EXPOSURE" else factors
+            if len(factors) != 3:
+                return (math.nan,) * 3
+            applied = [a * factor for a, factor in zip(applied, factors, strict=True)]
+    return tuple(1.0 / a if a > 0 else math.nan for a in applied)
 
 
 @lru_cache(maxsize=16)

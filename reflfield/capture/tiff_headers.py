@@ -7,7 +7,7 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
@@ -25,6 +25,8 @@ SAMPLES, TILE_WIDTH, TILE_HEIGHT, FORMAT, SUB_DIRECTORIES = 277, 322, 323, 339, 
 PAGE_NAME, TRANSFER, WHITE, PRIMARIES, ORIENTATION, EXTRA = 285, 301, 318, 319, 274, 338
 # Of Exif data: the directory of the camera's settings, the one of interoperability, its index.
 EXIF, INTEROPERABILITY, INDEX = 34665, 40965, 1
+# Exposure time (seconds), f-number and speed (ISO).
+EXPOSURE = (33434, 33437, 34855)
 DNG_VERSION = 50706
 COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
 # NEF, ARW, PEF and others compress mosaics in ways of their own.
@@ -34,7 +36,7 @@ RAW_COMPRESSIONS = (32767, 32769, 34713, 65000, 65535)
 READ = {
     *(SUBFILE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES, TILE_WIDTH, TILE_HEIGHT),
     *(FORMAT, SUB_DIRECTORIES, PAGE_NAME, WHITE, PRIMARIES, ORIENTATION, EXTRA),
-    *(EXIF, INTEROPERABILITY, INDEX),
+    *(EXIF, INTEROPERABILITY, INDEX, *EXPOSURE),
 }
 
 _TYPES = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "B", 8: "h", 9: "i", 10: "ii"}
@@ -154,27 +156,47 @@ def raw_evidence(path: Path) -> str:
     return ""
 
 
-def exif_facts(path: Path, exif: bytes) -> tuple[int, bool]:
-    """What the Exif data (a TIFF) of an image of another format say.
+@dataclass(frozen=True)
+class ExifFacts:
+    """What Exif data say.
 
-    Returns
-    -------
+    Parameters
+    ----------
     orientation : int
         How a viewer turns the image, 1 to 8; 1 is not at all.
     adobe_rgb : bool
         Whether the camera wrote Adobe RGB (interoperability index R03).
+    exposure : (seconds, f-number, ISO) tuple of float
+        0 where it is not stated.
     """
+
+    orientation: int = 1
+    adobe_rgb: bool = False
+    exposure: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def exif_facts(path: Path, exif: bytes) -> ExifFacts:
+    """What the Exif data (a TIFF) of an image of another format say."""
     if exif[:4] not in (b"II*\0", b"MM\0*"):
-        return 1, False
-    file, orientation, adobe_rgb = io.BytesIO(exif), 1, False
-    with suppress(CaptureError, struct.error, ValueError):  # the pixels may be sound
+        return ExifFacts()
+    return tiff_facts(path, io.BytesIO(exif))
+
+
+def tiff_facts(path: Path, file: IO[bytes]) -> ExifFacts:
+    """What the Exif data of an open TIFF file say; nothing where they are garbled."""
+    facts = ExifFacts()
+    with suppress(CaptureError, struct.error, ValueError, OverflowError):
         inner = next(_directories(path, file), {})
-        orientation = _first(inner, ORIENTATION, 1)
+        facts = ExifFacts(_first(inner, ORIENTATION, 1))
         for pointer in (EXIF, INTEROPERABILITY):
             position = _first(inner, pointer, 0)
             inner = next(_directories(path, file, position), {}) if position else {}
-        adobe_rgb = bytes(int(n) for n in inner.get(INDEX, ()))[:3] == b"R03"
-    return orientation, adobe_rgb
+            if pointer == EXIF:
+                time, stop, speed = (float((*inner.get(t, ()), 0)[0]) for t in EXPOSURE)
+                facts = replace(facts, exposure=(time, stop, speed))
+        index = bytes(int(n) for n in inner.get(INDEX, ()))
+        facts = replace(facts, adobe_rgb=index[:3] == b"R03")
+    return facts
 
 
 def _directories(path: Path, file: IO[bytes], first: int | None = None) -> Iterator[Tags]:

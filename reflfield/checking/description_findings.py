@@ -20,7 +20,11 @@ from reflfield.capture.consistency import (
 from reflfield.capture.image_files import image_orientation, image_size
 from reflfield.capture.inspect import largest_gap, object_centre
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT
-from reflfield.capture.plausibility import FARTHEST_LIGHTS, check_code_range
+from reflfield.capture.plausibility import (
+    FARTHEST_LIGHTS,
+    check_code_range,
+    differing_exposures,
+)
 from reflfield.capture.pose_convention import check_poses
 from reflfield.checking.findings import ERROR, NOTE, Finding
 from reflfield.errors import InputError
@@ -43,6 +47,7 @@ def description_findings(capture: Capture) -> Iterator[Finding]:
         "pairs of camera and light": lambda: check_pairs(capture),
         "light without light": lambda: check_lights(capture),
         "convention of poses": lambda: check_poses(capture.cameras, where),
+        "exposures": lambda: differing_exposures(capture),
     }
     for kind, check in refused.items():
         yield from _refusal(kind, check)

@@ -136,6 +136,14 @@ class TestOthers:
         (tmp_path / "a.hdr").write_bytes(content.replace(b"#?RADIANCE\n", lines, 1))
         np.testing.assert_allclose(read_image(tmp_path / "a.hdr"), 4.0, rtol=1e-2)
 
+    def test_radiance_hdr_colour_correction_is_undone(self, tmp_path):
+        assert cv2.imwrite(str(tmp_path / "a.hdr"), np.full((6, 40, 3), 8, np.float32))
+        content = (tmp_path / "a.hdr").read_bytes()
+        lines = b"#?RADIANCE\nCOLORCORR= 2 1 4\nEXPOSURE=2\nCOLORCORR=1 1 .5\n"
+        (tmp_path / "a.hdr").write_bytes(content.replace(b"#?RADIANCE\n", lines, 1))
+        expected = np.broadcast_to([2, 4, 2], (6, 40, 3))
+        np.testing.assert_allclose(read_image(tmp_path / "a.hdr"), expected, rtol=1e-2)
+
     @pytest.mark.parametrize(
         ("old", "new", "reason"),
         [
@@ -143,6 +151,7 @@ class TestOthers:
             (b"32-bit_rle_rgbe", b"32-bit_rle_xyze", "xyze"),
             (b"#?RADIANCE\n", b"#?RADIANCE\nGAMMA=2.2\n", "GAMMA"),
             (b"#?RADIANCE\n", b"#?RADIANCE\nEXPOSURE=0\n", "finite"),
+            (b"#?RADIANCE\n", b"#?RADIANCE\nCOLORCORR=2\n", "finite"),
         ],
     )
     def test_radiance_hdr_that_is_not_understood(self, tmp_path, old, new, reason):

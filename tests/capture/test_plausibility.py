@@ -1,16 +1,19 @@
 """Captures in another unit or range than they would be read in are refused or noted."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from reflfield.capture.encoding import parse_encoding
 from reflfield.capture.image_files import ImageReading, read_image
 from reflfield.capture.readers import open_capture
+from reflfield.checking.capture_check import check_capture
 from reflfield.errors import CaptureError
 
 FROZEN = Path(__file__).parents[1] / "data" / "capture_v1"
@@ -131,3 +134,55 @@ def test_principal_points_outside_of_the_image_are_noted(frozen, cx, n_notes):
     notes = [note for note in open_capture(frozen).notes if "outside of the image in" in note]
     assert len(notes) == n_notes
     assert all("image in v001 (" in note for note in notes)
+
+
+def in_files(folder, suffix, settings_of):
+    """Replace all photographs by files of a kind with Exif data (seconds, stop, ISO) each."""
+    for number, path in enumerate(sorted((folder / "photographs").glob("*.exr"))):
+        image = read_image(path)
+        picture = Image.fromarray(np.uint8(255 * np.clip(image, 0, 1)))
+        exif = picture.getexif()
+        stated = zip((33434, 33437, 34855), settings_of(number), strict=True)
+        exif[34665] = {tag: value for tag, value in stated if value}
+        picture.save(path.with_suffix(suffix), exif=exif.tobytes())
+    pattern = "photographs/{camera}_{light}" + suffix
+    described(folder, lambda document: document.update(photographs={"pattern": pattern}))
+
+
+class TestExposures:
+    @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+    @pytest.mark.parametrize(
+        "other", [(1 / 15, 8.0, 100), (1 / 60, 4.0, 100), (1 / 60, 8.0, 400)]
+    )
+    def test_photographs_exposed_differently_by_their_exif_data(self, frozen, suffix, other):
+        usual = (1 / 60, 8.0, 100)
+        in_files(frozen, suffix, lambda number: other if number == 2 else usual)
+        (note,) = open_capture(frozen).notes
+        assert re.search(rf"v000_l002\{suffix}: exposed 4 times as much as v00", note)
+        assert "0.01667 s, f/8, ISO 100; 1 of 6 files differ" in note
+        checked = check_capture(open_capture(frozen, require_photographs=False))
+        (finding,) = [found for found in checked.all if found.kind == "exposures"]
+        assert finding.severity == "note"
+
+    @pytest.mark.parametrize("values", [(1 / 60, 8.0, 100), (0, 0, 0), (1 / 60, 0, 0)])
+    def test_one_exposure_is_not_spoken_of(self, frozen, values):
+        in_files(frozen, ".jpg", lambda number: values)
+        assert open_capture(frozen).notes == ()
+
+    def test_stated_exposure_times_are_taken_off(self, frozen):
+        in_files(frozen, ".jpg", lambda number: (0.01 * 2**number, 8.0, 100))
+
+        def state(document):
+            names = sorted(path.name for path in (frozen / "photographs").glob("*.jpg"))
+            document["photographs"] = [
+                {"camera": name[:4], "light": name[5:9], "exposures":
+                 [{"file": f"photographs/{name}", "seconds": 0.01 * 2**number}]}
+                for number, name in enumerate(names)
+            ]  # fmt: skip
+
+        described(frozen, state)
+        assert open_capture(frozen).notes == ()
+
+    def test_exif_data_that_are_no_cameras(self, frozen):
+        in_files(frozen, ".jpg", lambda number: (2**32 - 1, 0, 0) if number else (1, 0, 0))
+        assert open_capture(frozen).notes == ()
