@@ -38,6 +38,7 @@ from reflfield.capture.documents import (
     parse_number,
     read_text,
 )
+from reflfield.capture.fixed_view import notes_on_lengths
 from reflfield.capture.lights import Light
 from reflfield.capture.names import IMAGE_SUFFIXES, frame_name, unique_names
 from reflfield.capture.paths import NamedFiles
@@ -58,6 +59,7 @@ class _Row:
     name: str
     view: str
     light: Light
+    place: tuple[float, ...]  # as it stands there
 
 
 def light_table_of(capture: Capture) -> Path | None:
@@ -122,7 +124,9 @@ def with_lights(capture: Capture, table: Path, *, follow_links: bool = False) ->
     details = f"{len(rows)} rows of {table}" + (
         f", which name {further} photographs" if further else ""
     )
-    notes = (f"{table}: no photograph for {unused}",) if unused else ()
+    notes = [f"{table}: no photograph for {unused}"] if unused else []
+    if rows[0].light.kind == "directional":
+        notes += notes_on_lengths([row.place for row in rows], table)
     return _lit(capture, pairs, details, notes)
 
 
@@ -335,4 +339,4 @@ def _row(words: Sequence[str], columns: Sequence[str], kind: str, table: Path) -
         **where,
     )
     name, view = (values.get(key, "").replace("\\", "/") for key in ("name", "view"))
-    return _Row(name, view, light)
+    return _Row(name, view, light, tuple(where.popitem()[1].tolist()))

@@ -20,6 +20,8 @@ from reflfield.util.quoting import quoted
 IMAGES, MASKS = "images", "masks"
 # A model in `sparse/0` stands two levels below its workspace, in `dense/0/sparse` three.
 LEVELS_UP = 3
+# Folders that other programs call the one of masks, without case and an s at the end.
+OTHER_MASKS = ("mask", "silhouette", "matte", "alpha", "segmentation", "foreground")
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,13 @@ class ViewFolders:
                 return path
         return None
 
+    def other_masks(self) -> list[str]:
+        """Names of folders that seem to hold masks and are not read, where there are none."""
+        if self.masks is not None:
+            return []
+        names = sorted(entry.name for entry in self.root.iterdir() if entry.is_dir())
+        return [n for n in names if n.casefold().removesuffix("s") in OTHER_MASKS]
+
     def _within(self, folder: str, name: str) -> str:
         return f"{folder}/{name}" if folder else name
 
@@ -102,10 +111,22 @@ def view_folders(
     for root in above:
         for name in images:
             if (root / name).is_dir():
-                masks = MASKS if (root / MASKS).is_dir() else None
                 files = NamedFiles(description, follow_links=follow_links, root=root)
-                return ViewFolders(files, name, masks)
+                return ViewFolders(files, name, _masks_in(root))
     raise CaptureError(
         f"{description}: expected the photographs in a folder {' or '.join(images)!r} beside "
         f"it or above it, received none up to {above[-1]}; put or link the photographs there"
     )
+
+
+def _masks_in(root: Path) -> str | None:
+    """Name of the folder of masks; None where there is none."""
+    folder = root / MASKS
+    if folder.is_dir():
+        return MASKS
+    if folder.exists() or folder.is_symlink():
+        raise CaptureError(
+            f"{folder}: expected a folder of masks, received a file or a link that leads to "
+            "none; remove it, or put the masks there"
+        )
+    return None

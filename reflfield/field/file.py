@@ -327,9 +327,11 @@ def _members(
     if names != expected:
         missing = sorted(set(expected) - set(names))
         surplus = sorted(set(names) - set(expected))
+        twice = sorted({name for name in names if names.count(name) > 1})
         raise FieldFileError(
             f"{path}: expected the members of a reflectance field, missing: "
-            f"{missing or 'none'}, not known: {surplus[:5] or 'none'}"
+            f"{missing or 'none'}, not known: {surplus[:5] or 'none'}, there more than once: "
+            f"{twice[:5] or 'none'}; copy or make it again"
         )
     return {info.filename: info for info in infos}
 

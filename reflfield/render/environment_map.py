@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.color_spaces import luminance
-from reflfield.capture.image_files import image_size, read_image
+from reflfield.capture.image_files import image_size, read_alpha, read_image, stores_alpha
 from reflfield.capture.lights import CONVENTIONS, Light
 from reflfield.errors import InputError
 from reflfield.render.distant_lights import DistantLights, merged_lights
@@ -31,6 +31,9 @@ logger = logging.getLogger(__name__)
 # Maps are reduced to at most this many rows before they are cut into lights:
 # 1.4 degrees a row, finer than the cells of a thousand lights.
 QUANTISATION_ROWS = 128
+# Pixels of maps with fewer rows are cut, so that each lights from all of its area: one row
+# would light from the horizon alone.
+LEAST_ROWS = 16
 # Share of the width by which a map may be off twice its height: borders cut or added.
 ASPECT_TOLERANCE = 0.01
 # Other layouts by width / height, and what images of that shape usually are.
@@ -122,7 +125,7 @@ class EnvironmentMap:
         width, height = image_size(path)
         check_latlong(str(path), width, height)
         radiance = read_image(path, what="environment map")
-        _tell_of_oddities(path, radiance)
+        _tell_of_oddities(path, radiance, read_alpha(path) if stores_alpha(path) else None)
         rotation = None
         if world_from_environment is not None:
             rotation = np.asarray(world_from_environment, np.float64)
@@ -219,8 +222,15 @@ class EnvironmentMap:
         return local @ self.world_from_environment.T
 
     def _reduced(self) -> tuple[Array, Array]:
-        """Directions and irradiances of pixels, merged to at most QUANTISATION_ROWS rows."""
+        """Directions and irradiances of pixels, merged to at most QUANTISATION_ROWS rows.
+
+        Of coarse maps those of at least LEAST_ROWS rows.
+        """
         height = len(self.radiance)
+        if height < LEAST_ROWS:
+            parts = -(-LEAST_ROWS // height)
+            finer = self.radiance.repeat(parts, axis=0).repeat(parts, axis=1)
+            return replace(self, radiance=finer)._reduced()
         step = -(-height // QUANTISATION_ROWS)
         # Strip by strip: double precision of a whole map takes gigabytes.
         strips = [self._merged_rows(row, step) for row in range(0, height, step)]
@@ -273,8 +283,16 @@ def _check_finite(radiance: NDArray[np.floating]) -> None:
         )
 
 
-def _tell_of_oddities(path: Path | str, radiance: NDArray[np.float32]) -> None:
+def _tell_of_oddities(
+    path: Path | str, radiance: NDArray[np.float32], alpha: NDArray[np.float32] | None
+) -> None:
     """Log what a map holds that is allowed and hardly meant."""
+    if alpha is not None:
+        logger.warning(
+            "%s: %d pixels of the map are not opaque, %d of them, of alpha 0, count as "
+            "black; remove the alpha channel if the whole map shall light",
+            path, int((alpha < 1).sum()), int((alpha <= 0).sum()),
+        )  # fmt: skip
     negative = int((radiance < 0).any(axis=2).sum())
     if negative:
         logger.warning(

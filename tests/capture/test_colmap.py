@@ -124,6 +124,17 @@ def test_masks_as_colmap_names_them(workspace):
     assert any("no mask for 3 of 5 cameras" in note for note in capture.notes)
 
 
+@pytest.mark.parametrize("name", ["mask", "Silhouettes", "alpha"])
+def test_a_folder_that_is_not_called_masks_is_spoken_of(workspace, name):
+    colmap_text(workspace / "sparse/0", ring(), NAMES)
+    (workspace / name).mkdir()
+    (note,) = open_capture(workspace).notes
+    assert f"and {name} beside the photographs is not read; rename it to 'masks'" in note
+    (workspace / "masks").symlink_to("masks")
+    with pytest.raises(CaptureError, match=r"masks: expected a folder of masks, received a"):
+        open_capture(workspace)
+
+
 def test_masks_of_which_none_fits_are_refused(workspace):
     colmap_binary(workspace / "sparse/0", ring(), NAMES)
     write_photographs(workspace / "masks", ["mask_1.png"])

@@ -175,3 +175,11 @@ def test_two_tables(dome, tmp_path):
     (tmp_path / "sparse/0/lights.csv").write_text(LAMPS)
     with pytest.raises(CaptureError, match="expected one table of lights"):
         open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(("row", "n_notes"), [("0,0.6,0.8", 0), ("0,90,30", 1), ("0,3,4", 1)])
+def test_directions_of_different_lengths_are_noted(dome, row, n_notes):
+    """Positions, or degrees."""
+    lights = f"name,dx,dy,dz\nl0,0,0,1\nl1,{row}\n"
+    notes = dome(["v0_l0.png", "v1_l1.png", "v2_l0.png"], lights).notes
+    assert sum("light directions have lengths of 1 to" in note for note in notes) == n_notes

@@ -4,6 +4,7 @@ import hashlib
 import json
 import pickle
 import tracemalloc
+import warnings
 import zipfile
 
 import numpy as np
@@ -183,6 +184,14 @@ def test_bad_headers_are_refused(path, change, text):
     edit_header(path, change)
     with pytest.raises(FieldFileError, match=text):
         _ = open_field(path).faces
+
+
+def test_members_that_are_there_twice_are_named(path):
+    with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the writer's own
+        archive.writestr("uv.bin", b"x")
+    with pytest.raises(FieldFileError, match=r"there more than once: \['uv\.bin'\]"):
+        open_field(path)
 
 
 def test_missing_and_surplus_members_are_refused(path):

@@ -194,6 +194,29 @@ def test_negative_values_and_black_maps_are_said(tmp_path, caplog):
     assert lights.irradiances[0, 0] > 0
 
 
+def test_transparent_pixels_are_said(tmp_path, caplog):
+    """As of the sky in a picture that was rendered without it."""
+    radiance = np.ones((4, 8, 4), np.float32)
+    write_exr(tmp_path / "sky.exr", radiance, list("RGBA"))
+    EnvironmentMap.open(tmp_path / "sky.exr")
+    assert caplog.text == ""
+    radiance[:2, :, 3] = 0
+    radiance[2, 0, 3] = 0.5
+    write_exr(tmp_path / "half.exr", radiance, list("RGBA"))
+    EnvironmentMap.open(tmp_path / "half.exr")
+    assert "half.exr: 17 pixels of the map are not opaque, 16 of them" in caplog.text
+
+
+@pytest.mark.parametrize("height", [1, 2, 3, 8])
+def test_pixels_of_coarse_maps_light_from_all_of_their_area(height):
+    """One row would light from the horizon alone."""
+    lights = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32)).quantise(256)
+    for normal in np.vstack([np.eye(3), -np.eye(3)]):
+        # Rows of 11 degrees are off by 0.8 %.
+        sent = irradiance(lights.directions, lights.irradiances, normal[None])
+        np.testing.assert_allclose(sent, np.pi, rtol=0.02)
+
+
 def test_solid_angles_fill_the_sphere(rounding):
     sky = EnvironmentMap(np.ones((33, 66, 3), np.float32))
     total = sky.solid_angles.sum() * 66
