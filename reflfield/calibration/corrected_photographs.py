@@ -22,9 +22,9 @@ def with_colors_corrected(
 ) -> Capture:
     """The capture with photographs that a matrix was applied to, written as linear OpenEXR.
 
-    Bracketed exposures are merged. A pixel that is saturated in one channel counts as
-    saturated in all, since the matrix mixes them; negative values become 0. Silhouettes that
-    come of alpha become files.
+    Bracketed exposures are merged, dark frames subtracted. A pixel that is saturated in one
+    channel counts as saturated in all, since the matrix mixes them; negative values become 0.
+    Silhouettes that come of alpha become files.
 
     Parameters
     ----------
@@ -41,7 +41,11 @@ def with_colors_corrected(
     """
     indices = track(range(len(capture.photographs)), len(capture.photographs), "colours")
     photographs = tuple(
-        replace(capture.photographs[i], exposures=(_corrected(capture, i, matrix, folder),))
+        replace(
+            capture.photographs[i],
+            exposures=(_corrected(capture, i, matrix, folder),),
+            dark=None,  # it is subtracted
+        )
         for i in indices
     )
     silhouettes = tuple(_silhouette(capture, view, folder) for view in range(capture.n_views))

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.clipping import kinds_of_bracket
+from reflfield.capture.dark_frames import DarkFrame
+from reflfield.capture.digest_text import camera_text, dark_pieces, light_text
 from reflfield.capture.exposures import merge_exposures
 from reflfield.capture.image_files import (
     AS_STATED,
     ImageReading,
     read_alpha,
     read_coverage,
+    read_described,
     read_exposure,
     read_image,
-    read_kinds,
     stores_alpha,
 )
 from reflfield.capture.lights import UNKNOWN, Light
+from reflfield.capture.names import check_unique
 from reflfield.capture.segmentation import silhouette_from_photographs
 from reflfield.errors import CaptureError
 from reflfield.util.file_digests import file_digest
@@ -72,6 +75,8 @@ class Photograph:
         One file, or several bracketed ones.
     is_test : bool
         True where the capture's maker keeps the photograph for comparison.
+    dark : DarkFrame, optional
+        What the camera sees without any lamp: it is subtracted.
     """
 
     name: str
@@ -79,6 +84,13 @@ class Photograph:
     light: int
     exposures: tuple[Exposure, ...]
     is_test: bool = False
+    dark: DarkFrame | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files that it is read from."""
+        dark = () if self.dark is None else (self.dark.path,)
+        return (*(exposure.path for exposure in self.exposures), *dark)
 
     @property
     def path(self) -> Path:
@@ -87,22 +99,30 @@ class Photograph:
 
     def read(self) -> NDArray[np.float32]:
         """Linear radiance, (h, w, 3) float32; bracketed exposures are merged."""
-        if len(self.exposures) == 1:
+        if len(self.exposures) == 1 and self.dark is None:
             first = self.exposures[0]
             return read_image(first.path, first.reading) / np.float32(first.seconds)
         return self.read_kinds()[0]
 
     def read_kinds(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Radiance and which of its values are measurements (`Capture.read_kinds`)."""
+        first = self.exposures[0]
         if len(self.exposures) == 1:
-            first = self.exposures[0]
-            image, kinds = read_kinds(first.path, first.reading)
-            return image / np.float32(first.seconds), kinds
+            read = read_described(first.path, first.reading)
+            image, kinds = read.image / np.float32(first.seconds), read.kinds
+        else:
+            image, kinds = self._read_bracket()
+        if self.dark is None:
+            return image, kinds
+        if len(self.exposures) > 1:
+            read = read_described(first.path, first.reading)
+        return self.dark.subtracted(image, kinds, read)
+
+    def _read_bracket(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         read = [read_exposure(e.path, e.reading) for e in self.exposures]
-        images, kinds_of_each, encodings = zip(*read, strict=True)
+        images, kinds, encodings = zip(*read, strict=True)
         seconds = [e.seconds for e in self.exposures]
-        merged = merge_exposures(images, seconds, encodings)
-        return merged, kinds_of_bracket(kinds_of_each, seconds)
+        return merge_exposures(images, seconds, encodings), kinds_of_bracket(kinds, seconds)
 
     def read_alpha(self) -> NDArray[np.float32] | None:
         """Alpha of the first file, (h, w) float32; None if it has none or is opaque."""
@@ -167,8 +187,8 @@ class Capture:
                 f"received {self.base_geometry!r}"
             )
         where = f"{self.description}: " if self.description else ""
-        _check_unique(f"{where}cameras", [c.id for c in self.cameras])
-        _check_unique(f"{where}lights", [light.id for light in self.lights])
+        check_unique(f"{where}cameras", [c.id for c in self.cameras])
+        check_unique(f"{where}lights", [light.id for light in self.lights])
         for photograph in self.photographs:
             _check_indices(photograph, self.n_views, self.n_lights)
 
@@ -323,6 +343,7 @@ class Capture:
                         replace(e, reading=replace(e.reading, **stated))
                         for e in photograph.exposures
                     ),
+                    dark=photograph.dark and photograph.dark.read_as(stated),
                 )
                 for photograph in self.photographs
             ),
@@ -388,9 +409,9 @@ class Capture:
     def _described(self, part: str, of_file: FileDigest) -> Iterator[bytes]:
         """Bytes that stand for one part of the capture."""
         if part == "cameras":
-            yield from (_camera_text(c).encode() for c in self.cameras)
+            yield from (camera_text(c).encode() for c in self.cameras)
         elif part == "lights":
-            yield from (_light_text(light).encode() for light in self.lights)
+            yield from (light_text(light).encode() for light in self.lights)
             yield from (
                 of_file(light.file, CaptureError) for light in self.lights if light.file
             )
@@ -406,6 +427,7 @@ class Capture:
                 for exposure in photograph.exposures:
                     yield f"{exposure.seconds} {exposure.reading}".encode()
                     yield of_file(exposure.path, CaptureError)
+                yield from dark_pieces(photograph.dark, of_file)
 
     def _silhouette_sources(self, view: int, of_file: FileDigest) -> Iterator[bytes]:
         """Bytes that stand for the photographs that a silhouette is made from."""
@@ -413,6 +435,7 @@ class Capture:
         for i in self._with_alpha(view) if self.base_geometry == PLANE else of_view:
             for exposure in self.photographs[i].exposures:
                 yield str(exposure.reading).encode() + of_file(exposure.path, CaptureError)
+            yield from dark_pieces(self.photographs[i].dark, of_file)
 
 
 def usual_base_geometry(n_views: int) -> str:
@@ -449,14 +472,6 @@ def _check_indices(photograph: Photograph, n_views: int, n_lights: int) -> None:
         )
 
 
-def _check_unique(what: str, ids: Sequence[str]) -> None:
-    seen: set[str] = set()
-    for id_ in ids:
-        if id_ in seen:
-            raise CaptureError(f"{what}: expected ids that differ, received {id_!r} twice")
-        seen.add(id_)
-
-
 def check_matches(path: Path | str, camera: Camera, width: int, height: int) -> None:
     """Demand an image of the size that its camera has.
 
@@ -481,18 +496,3 @@ def _indices(name: str, indices: ArrayLike | None, count: int) -> list[int]:
     if array.size and not (array.min() >= 0 and array.max() < count):
         raise CaptureError(f"{name}: expected indices in 0 .. {count - 1}, received {array}")
     return [int(i) for i in array]
-
-
-def _camera_text(camera: Camera) -> str:
-    numbers: list[Any] = [camera.width, camera.height, camera.fl_x, camera.fl_y]
-    numbers += [camera.cx, camera.cy, camera.distortion, camera.camera_from_world.tolist()]
-    numbers += [camera.skew] if camera.skew else []
-    return f"{camera.id} {camera.kind} {numbers}"
-
-
-def _light_text(light: Light) -> str:
-    numbers: list[Any] = [light.position.tolist(), light.direction.tolist()]
-    numbers += [light.intensity.tolist(), light.exponent, light.cone_angle, light.falloff_angle]
-    numbers += [light.convention, light.world_from_environment.tolist()]
-    numbers += [_light_text(member) for member in light.members]
-    return f"{light.id} {light.kind} {numbers}"

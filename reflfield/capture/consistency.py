@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from pathlib import Path
 
+from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture, check_matches
+from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.image_files import image_orientation, image_size
 from reflfield.capture.lights import ENVIRONMENT, GROUP
 from reflfield.errors import CaptureError
@@ -129,11 +132,49 @@ def check_photographs(capture: Capture) -> None:
         for exposure in photograph.exposures:
             size = image_size(exposure.path, exposure.reading)
             check_matches(exposure.path, camera, *size)
+    check_dark_frames(capture)
     _check_orientations(capture)
     _check_files_once(capture)
     for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
         if path is not None:
             check_matches(path, camera, *image_size(path))
+
+
+def check_dark_frames(capture: Capture) -> None:
+    """Demand dark frames that `check_dark_frame` accepts."""
+    photographs = {e.path for p in capture.photographs for e in p.exposures}
+    for dark, index in first_uses(capture):
+        check_dark_frame(dark, capture.cameras[capture.photographs[index].camera], photographs)
+
+
+def check_dark_frame(dark: DarkFrame, camera: Camera, photographs: Set[Path]) -> None:
+    """Demand that a dark frame exists, has its camera's size and is no photograph.
+
+    Raises
+    ------
+    CaptureError
+        Naming the file.
+    """
+    if not dark.path.exists():
+        raise CaptureError(
+            f"{dark.path}: dark frame of camera {camera.id!r} missing; copy it there, or "
+            "remove it from the description"
+        )
+    if dark.path in photographs:
+        raise CaptureError(
+            f"{dark.path}: expected a dark frame, taken without any lamp, received a file "
+            "that is a photograph, too; remove it from one of both"
+        )
+    check_matches(f"{dark.path}: dark frame", camera, *image_size(dark.path, dark.reading))
+
+
+def first_uses(capture: Capture) -> list[tuple[DarkFrame, int]]:
+    """Every dark frame of every camera, with the index of a photograph that it is for."""
+    first: dict[tuple[DarkFrame, int], int] = {}
+    for index, photograph in enumerate(capture.photographs):
+        if photograph.dark is not None:
+            first.setdefault((photograph.dark, photograph.camera), index)
+    return [(dark, index) for (dark, _), index in first.items()]
 
 
 def check_environments(capture: Capture) -> None:
@@ -170,12 +211,12 @@ def _check_orientations(capture: Capture) -> None:
     """Demand that no camera has photographs that a viewer would turn differently."""
     first: dict[int, tuple[int, Path]] = {}
     for photograph in capture.photographs:
-        for exposure in photograph.exposures:
-            turn = image_orientation(exposure.path)
-            known, path = first.setdefault(photograph.camera, (turn, exposure.path))
+        for file in photograph.files:
+            turn = image_orientation(file)
+            known, path = first.setdefault(photograph.camera, (turn, file))
             if turn != known:
                 raise CaptureError(
-                    f"{exposure.path}: expected Exif orientation {known} as {path.name} of the "
+                    f"{file}: expected Exif orientation {known} as {path.name} of the "
                     f"same camera {capture.cameras[photograph.camera].id!r} has, received "
                     f"{turn}; pixels are read as stored, so turn the files alike and remove "
                     "the entry"

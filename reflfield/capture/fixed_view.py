@@ -12,6 +12,7 @@ import numpy as np
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import PLANE, Capture, Exposure, Photograph
+from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.documents import check_counts
 from reflfield.capture.encoding import LINEAR, Encoding
 from reflfield.capture.image_files import AS_STATED, ImageReading
@@ -32,7 +33,8 @@ MOST_BEHIND = 0.25  # share of the lights with z <= 0 that may be slips or nearl
 MOST_UNEQUAL = 1.1
 # Words of files that lie beside photographs and are none.
 _OTHER_IMAGES = re.compile(r"mask|normals?|gt|ref|depth|albedo|dark|ambient|preview|thumb")
-_MASK = re.compile(r"mask")
+_MASK, _DARK = re.compile(r"mask"), re.compile(r"dark|ambient")
+_SHRUNK = re.compile(r"preview|thumb")
 _WORD_ENDS = re.compile(r"[_\-. ]+")
 _COLOUR_CHUNKS = (b"sRGB", b"gAMA", b"cHRM", b"cICP", b"iCCP")
 _FOLDERS = ("Objects", "images", "Images", "photographs", "jpg", "png", "jpeg-exports")
@@ -47,10 +49,13 @@ class FixedView:
     photographs : tuple of Path
         In the order of the lights.
     mask : Path or None
+    dark : tuple of Path
+        Images that are called a dark frame, or one of ambient light: one is subtracted.
     """
 
     photographs: tuple[Path, ...]
     mask: Path | None
+    dark: tuple[Path, ...] = ()
 
 
 def fixed_view_capture(
@@ -81,13 +86,19 @@ def fixed_view_capture(
     """
     check_counts(str(files.description), 1, len(lights), len(view.photographs))
     names = unique_names(list(view.photographs), files.root)
+    dark = DarkFrame(view.dark[0], reading=reading) if len(view.dark) == 1 else None
+    if dark is not None:
+        details = (*details, f"dark frame {dark.path}, subtracted from all photographs")
+    elif view.dark:
+        words = f"{files.description}: not subtracted: {listed([p.name for p in view.dark])}"
+        notes = (*notes, f"{words}, since only one dark frame can be; name it in capture.json")
     return Capture(
         name=printable(files.root.resolve().name),
         root=files.root,
         cameras=(camera,),
         lights=tuple(replace(light, id=f"l{i:04d}") for i, light in enumerate(lights)),
         photographs=tuple(
-            Photograph(name, 0, i, (Exposure(path, reading=reading),))
+            Photograph(name, 0, i, (Exposure(path, reading=reading),), dark=dark)
             for i, (name, path) in enumerate(zip(names, view.photographs, strict=True))
         ),
         base_geometry=PLANE,
@@ -209,6 +220,20 @@ def mask_beside(folder: Path, files: NamedFiles) -> Path | None:
     return masks[0] if len(masks) == 1 else None
 
 
+def dark_beside(
+    folder: Path, files: NamedFiles, photographs: Sequence[Path] = ()
+) -> tuple[Path, ...]:
+    """Images in a folder that are called a dark frame, or one of ambient light.
+
+    They show the view without any lamp: ``dark.png``, ``ambient.jpg``, ``cup_dark.png``. What
+    is listed among the photographs is none.
+    """
+    if not folder.is_dir():
+        return ()
+    called = [path for path in _images_in(folder, files) if _is_called(path, _DARK)]
+    return tuple(p for p in called if not _is_called(p, _SHRUNK) and p not in photographs)
+
+
 def linear_unless_stated(path: Path) -> ImageReading:
     """Reading of photometric stereo sets: PNG files that state no colour are linear.
 
@@ -225,7 +250,7 @@ def linear_unless_stated(path: Path) -> ImageReading:
 def _view_in(folder: Path, files: NamedFiles) -> FixedView:
     images = _images_in(folder, files)
     shown = [path for path in images if not _is_called(path, _OTHER_IMAGES)]
-    return FixedView(tuple(shown), mask_beside(folder, files))
+    return FixedView(tuple(shown), mask_beside(folder, files), dark_beside(folder, files))
 
 
 def _images_in(folder: Path, files: NamedFiles) -> list[Path]:

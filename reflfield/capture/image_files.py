@@ -60,6 +60,53 @@ class ImageReading:
 AS_STATED = ImageReading()
 
 
+@dataclass(frozen=True, eq=False)
+class ReadImage:
+    """An image file as linear RGB, and how it was stored.
+
+    Parameters
+    ----------
+    path : Path
+    image : (h, w, 3) float32
+        As of `read_image`.
+    kinds : (h, w, 3) uint8
+        As of `read_kinds`.
+    alpha : (h, w) float32 or None
+        None where there is none, or all is opaque.
+    integer : bool
+        Whether the file holds integers.
+    space : ColorSpace
+        What they were decoded by.
+    """
+
+    path: Path
+    image: Float32
+    kinds: Kinds
+    alpha: Float32 | None
+    integer: bool
+    space: ColorSpace
+
+    @property
+    def numbers(self) -> str:
+        """What the file holds, in words."""
+        kind = "integers" if self.integer else "floats"
+        primaries = "" if self.space.matrix is None else ", primaries of its own"
+        encoding = self.space.encoding
+        exponent = f" {encoding.gamma:g}" if encoding.name == "gamma" else ""
+        return f"{kind} (encoding {encoding.name}{exponent}{primaries})"
+
+    def is_stored_like(self, other: ReadImage) -> bool:
+        """Whether numbers of both files mean the same."""
+        own, theirs = (
+            np.eye(3) if one.space.matrix is None else one.space.matrix for one in (self, other)
+        )
+        return (
+            self.integer == other.integer
+            and self.space.encoding == other.space.encoding
+            and np.allclose(own, theirs, atol=1e-4)
+        )
+
+
 def read_image(
     path: Path | str, reading: ImageReading = AS_STATED, *, what: str = "photograph"
 ) -> Float32:
@@ -109,10 +156,25 @@ def read_kinds(
         Of `capture.clipping`: `MEASURED`; `SATURATED` at the limit of the sensor or the file,
         or beyond the last pair of a table; `BLACK`; `TRANSPARENT` under alpha 0.
     """
+    read = read_described(path, reading, what=what)
+    return read.image, read.kinds
+
+
+def read_described(
+    path: Path | str, reading: ImageReading = AS_STATED, *, what: str = "photograph"
+) -> ReadImage:
+    """Read an image as `read_kinds` does, and how it is stored."""
     path = Path(path)
     stored = _read(path, reading)
     image = _linear(path, stored, reading, what)
-    return image, np.broadcast_to(_kinds(stored, reading), image.shape)
+    return ReadImage(
+        path=path,
+        image=image,
+        kinds=np.broadcast_to(_kinds(stored, reading), image.shape),
+        alpha=_seen_through(stored),
+        integer=stored.integer,
+        space=_space(stored, reading),
+    )
 
 
 def read_small_kinds(
@@ -175,8 +237,7 @@ def read_exposure(
 
 def read_alpha(path: Path | str, reading: ImageReading = AS_STATED) -> Float32 | None:
     """Alpha of a photograph, (h, w) float32 in [0, 1]; None if it has none or is opaque."""
-    alpha = _read(Path(path), reading).alpha
-    return None if alpha is None or not (alpha < 1).any() else alpha
+    return _seen_through(_read(Path(path), reading))
 
 
 def largest_code_of_16(path: Path | str, reading: ImageReading = AS_STATED) -> int | None:
@@ -273,6 +334,12 @@ def _read(path: Path, reading: ImageReading) -> StoredImage:
     return decode_stored(path, header, choose_layer(path, header, reading.layer))
 
 
+def _seen_through(stored: StoredImage) -> Float32 | None:
+    """Alpha that is not 1 everywhere."""
+    alpha = stored.alpha
+    return None if alpha is None or not (alpha < 1).any() else alpha
+
+
 def _space(stored: StoredImage, reading: ImageReading) -> ColorSpace:
     return stored.stated() if reading.encoding is None else ColorSpace(reading.encoding)
 
@@ -280,9 +347,7 @@ def _space(stored: StoredImage, reading: ImageReading) -> ColorSpace:
 def _linear(path: Path, stored: StoredImage, reading: ImageReading, what: str) -> Float32:
     """Linear RGB, before black where there is alpha."""
     space = _space(stored, reading)
-    alpha = stored.alpha
-    if alpha is not None and not (alpha < 1).any():
-        alpha = None
+    alpha = _seen_through(stored)
     if alpha is not None and not (alpha > 0).any() and stored.colour.any():
         raise CaptureError(
             f"{path}: expected an alpha that leaves something to see, received 0 everywhere; "

@@ -149,8 +149,15 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
         camera_spread=largest_gap(views, pole),
         light_spread=largest_gap(np.reshape(lights, (-1, 3)), pole),
         object_centre=centre,
-        details=capture.details,
+        details=(*capture.details, *_dark_details(capture)),
     )
+
+
+def _dark_details(capture: Capture) -> tuple[str, ...]:
+    dark = {p.dark.path for p in capture.photographs if p.dark is not None}
+    n = sum(p.dark is not None for p in capture.photographs)
+    words = f"{len(dark)} dark frame{'s' * (len(dark) != 1)}, subtracted from {n} photographs"
+    return (words,) if dark else ()
 
 
 def object_centre(capture: Capture) -> NDArray[np.float64]:

@@ -30,6 +30,7 @@ from reflfield.capture.documents import (
 )
 from reflfield.capture.fixed_view import (
     FixedView,
+    dark_beside,
     fixed_view_capture,
     linear_unless_stated,
     mask_beside,
@@ -124,7 +125,11 @@ def listed_view(files: NamedFiles, n_lights: int) -> FixedView:
     photographs = tuple(files.path(name) for name in names)
     if not photographs[0].is_file():
         raise CaptureError(f"{photographs[0]}: photograph missing, which {path} names first")
-    return FixedView(photographs, mask_beside(files.root, files))
+    return FixedView(
+        photographs,
+        mask_beside(files.root, files),
+        dark_beside(photographs[0].parent, files, photographs),
+    )
 
 
 def directions_of(path: Path) -> Array:

@@ -21,6 +21,7 @@ from reflfield.capture.capture import Capture
 from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
 from reflfield.capture.fixed_view import (
     FixedView,
+    dark_beside,
     fixed_view_capture,
     notes_on_lengths,
     notes_on_lights_behind,
@@ -78,7 +79,7 @@ def read_lp(description: Path, *, follow_links: bool = False) -> Capture:
         *notes_on_lengths(directions, description),
     )
     return fixed_view_capture(
-        FixedView(tuple(paths), mask=None),
+        FixedView(tuple(paths), None, dark_beside(paths[0].parent, files, paths)),
         lights,
         files,
         camera=orthographic_camera(image_size(paths[0])),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+from reflfield.errors import CaptureError
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
@@ -73,3 +75,18 @@ def unique_names(paths: list[Path], root: Path) -> list[str]:
 def _repeated(names: Iterable[str]) -> set[str]:
     counts = Counter(name.casefold() for name in names)
     return {name for name, count in counts.items() if count > 1}
+
+
+def check_unique(what: str, ids: Sequence[str]) -> None:
+    """Demand ids that differ.
+
+    Raises
+    ------
+    CaptureError
+        Naming the first that repeats.
+    """
+    seen: set[str] = set()
+    for id_ in ids:
+        if id_ in seen:
+            raise CaptureError(f"{what}: expected ids that differ, received {id_!r} twice")
+        seen.add(id_)

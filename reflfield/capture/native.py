@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from itertools import islice
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
 from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.documents import LARGEST_COORDINATE, check_counts, read_json
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.lenses import NAMES as LENS_KEYS
@@ -248,6 +249,7 @@ def _photographs(
     light = {light.id: i for i, light in enumerate(lights)}
     reading = stated_reading(document, files, str(files.description))
     exposures = [_exposures(entry, files, reading) for entry in listed]
+    dark_frames = _dark_frames(document, listed, files, reading)
     names = unique_names([e[0].path for e in exposures], files.root)
     return tuple(
         Photograph(
@@ -255,8 +257,11 @@ def _photographs(
             camera=_known(view, entry["camera"], "camera", files),
             light=_known(light, entry["light"], "light", files),
             exposures=files_of_entry,
+            dark=dark,
         )
-        for name, entry, files_of_entry in zip(names, listed, exposures, strict=True)
+        for name, entry, files_of_entry, dark in zip(
+            names, listed, exposures, dark_frames, strict=True
+        )
     )
 
 
@@ -280,6 +285,37 @@ def _exposures(
     listed = entry.get("exposures") or [{"file": entry["file"], "seconds": 1.0}]
     reading = stated_reading(entry, files, f"{files.description}: photographs", of_all)
     return tuple(Exposure(files.path(e["file"]), e["seconds"], reading) for e in listed)
+
+
+def _dark_frames(
+    document: Mapping[str, Any],
+    listed: Sequence[Mapping[str, Any]],
+    files: NamedFiles,
+    of_all: ImageReading,
+) -> Iterator[DarkFrame | None]:
+    """Dark frame of each photograph: its own, its camera's, or that of all."""
+    of_cameras = {camera["id"]: camera.get("dark") for camera in document["cameras"]}
+    for entry in listed:
+        dark = entry.get("dark") or of_cameras.get(entry["camera"]) or document.get("dark")
+        if not dark:
+            yield None
+            continue
+        stated: Mapping[str, Any] = {"file": dark} if isinstance(dark, str) else dark
+        timed = "exposures" in entry
+        if timed != ("seconds" in stated):
+            expected, received = ("no ", "one") if not timed else ("an ", "none")
+            raise CaptureError(
+                f"{files.description}: dark frame {quoted(stated['file'])}: expected "
+                f"{expected}exposure time, 'seconds', as its photographs have, received "
+                f"{received}; state the times of both, or of neither if they are equal"
+            )
+        reading = stated_reading(entry, files, f"{files.description}: photographs", of_all)
+        where = f"{files.description}: dark"
+        yield DarkFrame(
+            files.path(stated["file"]),
+            stated.get("seconds", 1.0),
+            stated_reading(stated, files, where, reading),
+        )
 
 
 def _known(index: Mapping[str, int], id_: str, what: str, files: NamedFiles) -> int:

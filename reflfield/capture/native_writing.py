@@ -37,13 +37,19 @@ def native_description(capture: Capture, files: WrittenFiles) -> None:
             "light": lights[photograph.light],
             **files.reading(first.reading),
         }
-        if len(own) == 1 and first.seconds == 1:
+        dark = photograph.dark
+        timed = first.seconds != 1 or (dark is not None and dark.seconds != 1)
+        if len(own) == 1 and not timed:
             entry["file"] = own[0]
         else:
             entry["exposures"] = [
                 {"file": name, "seconds": exposure.seconds}
                 for name, exposure in zip(own, photograph.exposures, strict=True)
             ]
+        if dark is not None:
+            of_dark = {} if "file" in entry else {"seconds": dark.seconds}
+            of_dark |= files.reading(dark.reading) if dark.reading != first.reading else {}
+            entry["dark"] = {"file": files.dark_frame(dark.path), **of_dark}
         photographs.append(entry)
     document = {
         "format": FORMAT,

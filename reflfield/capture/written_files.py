@@ -30,6 +30,7 @@ class WrittenFiles:
         self.written: list[Path] = []
         self._tables: dict[Encoding, str] = {}
         self._copies: dict[tuple[Path, str], str] = {}
+        self._dark: dict[Path, int] = {}
 
     def text(self, name: str, content: str) -> None:
         """Write a text file."""
@@ -55,6 +56,11 @@ class WrittenFiles:
         if len(exposures) == 1:
             return [self.add(exposures[0].path, name)]
         return [self.add(exposure.path, f"{name}_{i}") for i, exposure in enumerate(exposures)]
+
+    def dark_frame(self, path: Path) -> str:
+        """Copy a dark frame once; they are numbered."""
+        number = self._dark.setdefault(path, len(self._dark))
+        return self.add(path, f"dark/d{number:04d}")
 
     def silhouettes(self, capture: Capture, folder: str) -> list[str | None]:
         """Copy the silhouettes that are files, under the names of their cameras."""
@@ -107,8 +113,13 @@ def first_reading(photograph: Photograph, target: str) -> ImageReading:
     Raises
     ------
     InputError
-        If there are several exposures, of which the target knows nothing.
+        If there are several exposures, or a dark frame, of which the target knows nothing.
     """
+    if photograph.dark is not None:
+        raise InputError(
+            f"photograph {photograph.name!r}: expected no dark frame, which {target} cannot "
+            f"say, received {photograph.dark.path}; write it with `to='native'`"
+        )
     if len(photograph.exposures) > 1 or photograph.exposures[0].seconds != 1:
         raise InputError(
             f"photograph {photograph.name!r}: expected one exposure, which is all that "

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from reflfield.capture.capture import PLANE, Capture
 from reflfield.capture.inspect import object_centre, spread_evenly
 from reflfield.checking.checked_views import CheckedView, UnusableView, checked_views
+from reflfield.checking.dark_frame_findings import dark_frame_findings
 from reflfield.checking.description_findings import (
     code_range_finding,
     coverage_findings,
@@ -84,6 +85,8 @@ def check_capture(capture: Capture) -> Findings:
     Findings
     """
     findings = list(description_findings(capture))
+    of_dark_frames, capture = dark_frame_findings(capture)
+    findings += of_dark_frames
     of_files, usable = file_findings(capture)
     findings += of_files
     if not usable:

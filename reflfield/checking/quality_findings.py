@@ -268,9 +268,20 @@ def ambient_findings(capture: Capture, shading: Shading) -> Iterator[Finding]:
             (),
             f"surfaces that face away from the lamp are {100 * ambient:.0f} % as bright as "
             "those that face it (median over photographs)",
-            "darken the room; or photograph each view without any lamp and subtract that "
-            "photograph from the others before they are read",
+            _without_ambient(capture),
         )
+
+
+def _without_ambient(capture: Capture) -> str:
+    if any(photograph.dark is not None for photograph in capture.photographs):
+        return (
+            "darken the room; the dark frames that are subtracted do not hold this light: take "
+            "them again, with the room lit as for the photographs"
+        )
+    return (
+        "darken the room; or photograph each view without any lamp, and name that photograph "
+        "'dark' in capture.json: it is subtracted"
+    )
 
 
 def vignetting_findings(shading: Shading, capture: Capture) -> Iterator[Finding]:

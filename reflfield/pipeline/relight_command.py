@@ -52,7 +52,7 @@ def check_kept(capture: Capture, written: Iterable[Path]) -> None:
     InputError
         Naming the first of them.
     """
-    read = {e.path.resolve() for p in capture.photographs for e in p.exposures}
+    read = {path.resolve() for p in capture.photographs for path in p.files}
     read |= {path.resolve() for path in capture.silhouettes if path is not None}
     read |= {light.file.resolve() for light in capture.lights if light.file is not None}
     for path in written:
