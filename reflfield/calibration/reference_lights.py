@@ -21,6 +21,7 @@ from reflfield.calibration.sphere_reflections import (
 )
 from reflfield.capture.clipping import SATURATED
 from reflfield.capture.image_files import AS_STATED, ImageReading, read_kinds
+from reflfield.capture.plausibility import SHORTEST_FOCAL
 from reflfield.errors import InputError
 from reflfield.util.files import replacing
 from reflfield.util.progress import track
@@ -32,8 +33,6 @@ TABLE, DIRECTIONS = "lights.csv", "lights.lp"
 # Photographs that circles are sought in, evenly spread.
 MOST_SEARCHED = 24
 SUFFIXES = (".exr", ".tif", ".tiff", ".png", ".jpg", ".jpeg", ".hdr", ".cr2", ".nef", ".dng")
-# Lenses with straight lines have at least this focal length, in the longer side of the image.
-SHORTEST_FOCAL = 0.25
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 

@@ -19,7 +19,7 @@ from reflfield.capture.paths import NamedFiles
 from reflfield.capture.unique_items import UniqueItems, camera_key, leading_digits, numbered
 from reflfield.capture.view_folders import ViewFolders
 from reflfield.errors import CaptureError
-from reflfield.util.quoting import listed, printable, quoted
+from reflfield.util.quoting import printable, quoted
 
 UNKNOWN_LIGHT = Light("l", "unknown")
 # Pixels by which the sides of a reduced photograph may differ from the exact ratio.
@@ -217,14 +217,10 @@ def _mask_details(folders: ViewFolders) -> list[str]:
 
 def _mask_notes(folders: ViewFolders, silhouettes: Sequence[Path | None]) -> list[str]:
     """Refuse a folder of masks of which none fits; say where some, or all, are not read."""
-    others = folders.other_masks()
-    if others:
-        return [
-            f"{folders.root}: no folder 'masks', and {listed(others)} beside the photographs "
-            "is not read; rename it to 'masks' if it holds masks"
-        ]
+    if folders.masks is None:
+        return folders.notes_on_other_masks()
     without = sum(path is None for path in silhouettes)
-    if folders.masks is None or not without:
+    if not without:
         return []
     where = folders.root / folders.masks
     if without == len(silhouettes):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reflfield.capture.cameras import ORTHOGRAPHIC
+from reflfield.capture.cameras import FISHEYE, ORTHOGRAPHIC, Camera
 from reflfield.capture.capture import Capture
 from reflfield.capture.image_files import largest_code_of_16, stated_exposure
 from reflfield.capture.inspect import object_centre, spread_evenly
@@ -27,6 +27,10 @@ FARTHEST_LIGHTS = 100.0
 SAME_EXPOSURE = 1.12
 # Larger seconds, f-numbers and speeds are damaged data.
 MOST_STATED = 1e8
+# Lenses with straight lines have at least this focal length, in the longer side of the image.
+SHORTEST_FOCAL = 0.25
+# Principal points of whole photographs lie at least so far from the border, in its sides.
+NEAREST_TO_BORDER = 0.05
 # Pixels of today's sensors are square.
 LARGEST_ASPECT = 1.5
 
@@ -104,21 +108,46 @@ def oblong_pixels(capture: Capture) -> tuple[str, ...]:
     )
 
 
-def stray_principal_points(capture: Capture) -> tuple[str, ...]:
-    """A note on cameras whose principal point lies outside of their images."""
-    stray = [
+def wide_lenses(capture: Capture) -> tuple[str, ...]:
+    """A note on pinhole cameras that see more than lenses with straight lines do."""
+    wide = [
         camera
         for camera in capture.cameras
-        if camera.kind != ORTHOGRAPHIC
-        and not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height)
+        if camera.kind not in (ORTHOGRAPHIC, FISHEYE)
+        and max(camera.fl_x, camera.fl_y) < SHORTEST_FOCAL * max(camera.width, camera.height)
     ]
+    if not wide:
+        return ()
+    first = wide[0]
+    angle = 2 * np.degrees(np.arctan(first.width / 2 / first.fl_x))
+    return (
+        f"{capture.description}: focal lengths are shorter than those of any lens that keeps "
+        f"lines straight in {listed([camera.id for camera in wide])} ({first.fl_x:.6g} pixels "
+        f"for a width of {first.width}, which shows {angle:.4g} degrees); are they in "
+        "millimetres, or shares of the width?",
+    )
+
+
+def stray_principal_points(capture: Capture) -> tuple[str, ...]:
+    """A note on cameras whose principal point lies at the border of their images or outside."""
+    stray = [camera for camera in capture.cameras if camera.kind != ORTHOGRAPHIC
+             and not _is_within(camera)]  # fmt: skip
     if not stray:
         return ()
     first = stray[0]
     return (
-        f"{capture.description}: the principal point lies outside of the image in "
-        f"{listed([camera.id for camera in stray])} ({first.cx:.6g}, {first.cy:.6g} of "
-        f"{first.width} x {first.height} pixels); are photographs reduced or cropped?",
+        f"{capture.description}: the principal point lies outside of the image or at its "
+        f"border in {listed([camera.id for camera in stray])} ({first.cx:.6g}, {first.cy:.6g} "
+        f"of {first.width} x {first.height} pixels); are photographs reduced or cropped, or "
+        "cx and cy shares of the image?",
+    )
+
+
+def _is_within(camera: Camera) -> bool:
+    near = NEAREST_TO_BORDER
+    return all(
+        near * side <= centre <= (1 - near) * side
+        for centre, side in ((camera.cx, camera.width), (camera.cy, camera.height))
     )
 
 

@@ -23,12 +23,14 @@ from reflfield.capture.consistency import (
 from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.image_files import AS_STATED, ImageReading
 from reflfield.capture.light_table import light_table_of, with_lights
+from reflfield.capture.masks_beside import with_masks_beside
 from reflfield.capture.plausibility import (
     check_code_range,
     differing_exposures,
     far_lights,
     oblong_pixels,
     stray_principal_points,
+    wide_lenses,
 )
 from reflfield.capture.pose_convention import check_poses
 from reflfield.errors import CaptureError
@@ -110,6 +112,7 @@ def open_capture(
             *far_lights(capture),
             *oblong_pixels(capture),
             *stray_principal_points(capture),
+            *wide_lenses(capture),
         )
         capture = replace(capture, notes=(*capture.notes, *more))
     for note in capture.notes:
@@ -118,18 +121,22 @@ def open_capture(
 
 
 def _read(description: Path, format: str, *, follow_links: bool, test_split: bool) -> Capture:
-    """Read a description of a known format."""
+    """Read a description of a known format, and masks that it may not name."""
     if format == "transforms":
-        return transforms_json.read_transforms(
+        capture = transforms_json.read_transforms(
             description, follow_links=follow_links, test_split=test_split
         )
+        return with_masks_beside(capture, follow_links=follow_links)
     if test_split:
         raise CaptureError(
             f"test_split: expected transforms.json with a test split, received {description}, "
             f"a {format} capture, which has none; hold out views=K, lights=K or "
             "photographs=K instead"
         )
-    return READERS[format].read(description, follow_links=follow_links)
+    capture = READERS[format].read(description, follow_links=follow_links)
+    if format in OWN_READERS:
+        return with_masks_beside(capture, follow_links=follow_links)
+    return capture
 
 
 def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:

@@ -181,11 +181,10 @@ def _distortion(frame: Frame) -> tuple[float, ...]:
 def _focal_lengths(frame: Frame, width: int, height: int) -> tuple[float, float]:
     """Focal lengths in pixels, from the frame's own values before the file's."""
     own, common = (_stated(frame, level, width, height) for level in frame.levels)
-    fl_x = own["x"] or common["x"]
-    fl_y = own["y"]
-    if fl_y is None and (own["x"] is None or own["is_length"]):
-        # A length of the frame's own leaves the file's other length, an angle does not.
-        fl_y = common["y"] if own["x"] is None or common["is_length"] else None
+    fl_x, fl_y = (
+        own[axis] or _of_file(own[other], own["is_length"], common, axis)
+        for axis, other in (("x", "y"), ("y", "x"))
+    )
     fl_x, fl_y = fl_x or fl_y, fl_y or fl_x
     if fl_x is None or fl_y is None:
         raise CaptureError(
@@ -194,6 +193,20 @@ def _focal_lengths(frame: Frame, width: int, height: int) -> tuple[float, float]
             "received none"
         )
     return fl_x, fl_y
+
+
+def _of_file(
+    other: float | None, is_length: float | None, common: Mapping[str, Any], axis: str
+) -> float | None:
+    """The file's focal length of an axis that the frame does not state.
+
+    Where the frame states that of the other axis, a length leaves the file's length, an
+    angle does not.
+    """
+    if other is None or (is_length and common["is_length"]):
+        value: float | None = common[axis]
+        return value
+    return None
 
 
 def _stated(

@@ -15,7 +15,7 @@ from pathlib import Path
 from reflfield.capture.names import IMAGE_SUFFIXES
 from reflfield.capture.paths import NamedFiles
 from reflfield.errors import CaptureError
-from reflfield.util.quoting import quoted
+from reflfield.util.quoting import listed, quoted
 
 IMAGES, MASKS = "images", "masks"
 # A model in `sparse/0` stands two levels below its workspace, in `dense/0/sparse` three.
@@ -76,12 +76,16 @@ class ViewFolders:
                 return path
         return None
 
-    def other_masks(self) -> list[str]:
-        """Names of folders that seem to hold masks and are not read, where there are none."""
-        if self.masks is not None:
-            return []
+    def notes_on_other_masks(self) -> list[str]:
+        """A note on folders that seem to hold masks, where there is none of the usual name."""
         names = sorted(entry.name for entry in self.root.iterdir() if entry.is_dir())
-        return [n for n in names if n.casefold().removesuffix("s") in OTHER_MASKS]
+        others = [n for n in names if n.casefold().removesuffix("s") in OTHER_MASKS]
+        if self.masks is not None or not others:
+            return []
+        return [
+            f"{self.root}: no folder 'masks', and {listed(others)} beside the photographs is "
+            "not read; rename it to 'masks' if it holds masks"
+        ]
 
     def _within(self, folder: str, name: str) -> str:
         return f"{folder}/{name}" if folder else name
@@ -112,15 +116,21 @@ def view_folders(
         for name in images:
             if (root / name).is_dir():
                 files = NamedFiles(description, follow_links=follow_links, root=root)
-                return ViewFolders(files, name, _masks_in(root))
+                return ViewFolders(files, name, masks_in(root))
     raise CaptureError(
         f"{description}: expected the photographs in a folder {' or '.join(images)!r} beside "
         f"it or above it, received none up to {above[-1]}; put or link the photographs there"
     )
 
 
-def _masks_in(root: Path) -> str | None:
-    """Name of the folder of masks; None where there is none."""
+def masks_in(root: Path) -> str | None:
+    """Name of the folder of masks; None where there is none.
+
+    Raises
+    ------
+    CaptureError
+        If there is something else of that name.
+    """
     folder = root / MASKS
     if folder.is_dir():
         return MASKS

@@ -128,12 +128,31 @@ def test_oblong_pixels_are_noted(frozen, factor, n_notes):
     assert len(notes) == n_notes
 
 
-@pytest.mark.parametrize(("cx", "n_notes"), [(0.0, 0), (9_000.0, 1), (-1.0, 1)])
-def test_principal_points_outside_of_the_image_are_noted(frozen, cx, n_notes):
-    described(frozen, lambda document: document["cameras"][1].update(cx=cx))
-    notes = [note for note in open_capture(frozen).notes if "outside of the image in" in note]
+@pytest.mark.parametrize(
+    ("share", "n_notes"), [(0.1, 0), (0.9, 0), (0.0, 1), (0.01, 1), (0.99, 1), (90, 1), (-1, 1)]
+)
+def test_principal_points_at_the_border_or_outside_are_noted(frozen, share, n_notes):
+    """As cx and cy that are shares of the image's sides."""
+    described(frozen, lambda doc: doc["cameras"][1].update(cx=share * doc["cameras"][1]["w"]))
+    notes = [note for note in open_capture(frozen).notes if "principal point" in note]
     assert len(notes) == n_notes
-    assert all("image in v001 (" in note for note in notes)
+    assert all("border in v001 (" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("share", "model", "n_notes"),
+    [(0.3, "opencv", 0), (0.2, "opencv", 1), (0.2, "opencv_fisheye", 0)],
+)
+def test_lenses_wider_than_there_are_are_noted(frozen, share, model, n_notes):
+    def widen(document):
+        camera = document["cameras"][0]
+        length = share * max(camera["w"], camera["h"])
+        camera.update(model=model, fl_x=length, fl_y=length)
+
+    described(frozen, widen)
+    notes = [note for note in open_capture(frozen).notes if "in millimetres, or" in note]
+    assert len(notes) == n_notes
+    assert all("straight in v000 (" in note for note in notes)
 
 
 def in_files(folder, suffix, settings_of):

@@ -130,6 +130,12 @@ class TestIntrinsics:
         camera = opened(tmp_path, frames, {"fl_x": 100, "fl_y": 99, "w": 8, "h": 6}).cameras[0]
         np.testing.assert_allclose([camera.fl_x, camera.fl_y], [4, 4], rtol=1e-15)
 
+    @pytest.mark.parametrize(("own", "top"), [("x", "y"), ("y", "x"), ("x", "x"), ("y", "y")])
+    def test_one_angle_of_a_frame_means_square_pixels(self, tmp_path, own, top):
+        frames = [frame("a", **{f"camera_angle_{own}": np.pi / 2})]
+        camera = opened(tmp_path, frames, {f"fl_{top}": 100, "w": 8, "h": 8}).cameras[0]
+        np.testing.assert_allclose([camera.fl_x, camera.fl_y], [4, 4], rtol=1e-15)
+
     def test_angle_of_a_frame_before_the_intrinsics_of_the_file(self, tmp_path):
         top = {"camera_intrinsics": [3.5, 2.5, 20, 21], "w": 8, "h": 6}
         camera = opened(tmp_path, [frame("a", camera_angle_x=np.pi / 2)], top).cameras[0]
