@@ -152,14 +152,16 @@ def _is_within(camera: Camera) -> bool:
 
 
 def differing_exposures(capture: Capture) -> tuple[str, ...]:
-    """A note on photographs that were exposed differently, as their Exif data say.
+    """A note on photographs and dark frames exposed differently, as their Exif data say.
 
     Exposure times that the description states are taken off. Photographs that cannot be read
     are left out.
     """
     light: dict[tuple[bool, ...], list[tuple[float, Path, tuple[float, ...]]]] = {}
     for photograph in capture.photographs:
-        for exposure in photograph.exposures:
+        for exposure in (*photograph.exposures, photograph.dark):
+            if exposure is None:
+                continue
             stated = _exposure_of(exposure.path)
             known = tuple(value > 0 for value in stated)
             seconds, stop, speed = (value or 1.0 for value in stated)

@@ -110,6 +110,9 @@ def check_capture(capture: Capture) -> Findings:
         findings += of_views
         findings += _of_surface(capture, photographs, shape, fits)
     told = {name for one in findings if one.kind in OUT_OF_PLACE for name in one.subjects}
+    for finding in findings:
+        # Exchanged, both are where pixels may repeat others'.
+        told -= set(finding.subjects) if finding.kind == "swapped photographs" else set()
     findings += repeated_findings(capture, photographs, told if fits else None)
     return Findings.sorted(findings, measures(capture))
 

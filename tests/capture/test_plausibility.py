@@ -202,6 +202,20 @@ class TestExposures:
         described(frozen, state)
         assert open_capture(frozen).notes == ()
 
+    def test_a_dark_frame_of_another_exposure(self, frozen):
+        in_files(frozen, ".jpg", lambda number: (1 / 60, 8.0, 400 if number == 5 else 100))
+
+        def name_dark_frame(document):
+            *names, dark = sorted(path.name for path in (frozen / "photographs").glob("*.jpg"))
+            document["photographs"] = [
+                {"camera": name[:4], "light": name[5:9], "file": f"photographs/{name}",
+                 "dark": f"photographs/{dark}"}
+                for name in names
+            ]  # fmt: skip
+
+        described(frozen, name_dark_frame)
+        assert any("exposed 4 times as much" in note for note in open_capture(frozen).notes)
+
     def test_exif_data_that_are_no_cameras(self, frozen):
         in_files(frozen, ".jpg", lambda number: (2**32 - 1, 0, 0) if number else (1, 0, 0))
         assert open_capture(frozen).notes == ()

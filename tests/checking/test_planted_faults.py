@@ -110,6 +110,12 @@ def test_a_swap_between_views_of_a_dark_underside_is_named(planted, check_folder
     assert named(check_folder(planted.folder), "swapped photographs") == names
 
 
+def test_a_swapped_photograph_that_repeats_pixels_is_no_other_fault(planted, check_folder):
+    """From two sides of the amphora the same pixels are right: of v015 under l006, too."""
+    f.swap_files(planted.photograph(17, 12), planted.photograph(15, 6))
+    assert grave(check_folder(planted.folder)) == {"swapped photographs"}
+
+
 @pytest.mark.parametrize("view", [3, 16])
 def test_a_patch_of_backdrop_in_a_mask_is_a_fault_of_the_mask(view, planted, check_folder):
     planted.change_mask(view, f.with_blob)
