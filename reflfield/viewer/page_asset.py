@@ -22,7 +22,7 @@ from reflfield.field.array_schemas import INDIRECT_ARRAYS, SCHEMAS
 from reflfield.field.evaluation import evaluate
 from reflfield.field.observed_sphere import covered, table_directions
 from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
-from reflfield.geometry.mesh import Mesh, welded
+from reflfield.geometry.mesh import Mesh
 
 FORMAT, VERSION = "reflfield-object", 1
 FIRST_ARRAYS = ("positions", "position_box", "faces", "uv", "uv_box")
@@ -174,8 +174,6 @@ def _header(field: ReflectanceField, mesh: Mesh, has_indirect: bool) -> dict[str
         "sides": sides,
         "up": field.up.tolist(),
         "texel_width": float(np.sqrt(mesh.area / field.n_texels)),
-        # Of a closed surface shadow maps hold the far sides, which need no bias.
-        "closed": welded(mesh)[0].watertight,
     }
 
 

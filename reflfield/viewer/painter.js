@@ -27,6 +27,8 @@ class Painter {
     this.present = compiledProgram(gl, FULL_SCREEN, PRESENT);
     this.adding = compiledProgram(gl, FULL_SCREEN, ADD_UP);
     this.depthOnly = compiledProgram(gl, VERTEX, DEPTH_ONLY);
+    this.depthBehind = compiledProgram(gl, VERTEX, DEPTH_BEHIND);
+    this.depthBetween = compiledProgram(gl, FULL_SCREEN, DEPTH_BETWEEN);
     this.nothing = gl.createVertexArray();
     const named = gl.getExtension("WEBGL_debug_renderer_info");
     const renderer = named ? gl.getParameter(named.UNMASKED_RENDERER_WEBGL) : "";
@@ -110,31 +112,41 @@ class Painter {
     gl.depthMask(false);
   }
 
+  // Maps of the depth half way between the surface that the light reaches and the next one, but
+  // not far behind the first. A bias in proportion to the slope would leak at outlines; far sides
+  // alone would, and halves of thick parts, where the light leaves the object and grazes it again.
   drawShadows(lamps) {
-    const { gl, shadows } = this, places = this.use(this.depthOnly);
+    const { gl, shadows } = this;
+    const nearest = { target: gl.TEXTURE_2D, texture: shadows.nearest.texture };
+    const behind = { target: gl.TEXTURE_2D, texture: shadows.behind.texture };
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
-    gl.depthFunc(gl.LESS);
     gl.depthMask(true);
     gl.viewport(0, 0, shadows.side, shadows.side);
-    if (this.header.closed) {
-      gl.enable(gl.CULL_FACE);
-      gl.cullFace(gl.FRONT);
-    } else {
-      gl.enable(gl.POLYGON_OFFSET_FILL);
-      gl.polygonOffset(2, 4);
-    }
     lamps.forEach((lamp, i) => {
       if (!lamp.casts) return;
+      this.drawDepths(this.depthOnly, lamp, shadows.nearest.framebuffer, {});
+      this.drawDepths(this.depthBehind, lamp, shadows.behind.framebuffer, { u_nearest: nearest });
       gl.bindFramebuffer(gl.FRAMEBUFFER, shadows.framebuffers[i]);
-      gl.clear(gl.DEPTH_BUFFER_BIT);
-      gl.uniformMatrix4fv(places.u_clip, false, lamp.clip);
-      this.drawMesh();
+      gl.depthFunc(gl.ALWAYS);
+      const places = this.use(this.depthBetween);
+      this.bindSamplers(places, { u_nearest: nearest, u_behind: behind });
+      gl.uniform2f(places.u_range, lamp.camera.near, lamp.camera.far);
+      gl.uniform1i(places.u_is_parallel, lamp.camera.parallel ? 1 : 0);
+      this.drawScreen();
     });
-    gl.disable(gl.CULL_FACE);
-    gl.disable(gl.POLYGON_OFFSET_FILL);
     gl.depthMask(false);
     gl.depthFunc(gl.LEQUAL);
+  }
+
+  drawDepths(program, lamp, framebuffer, samplers) {
+    const { gl } = this, places = this.use(program);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.depthFunc(gl.LESS);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    this.bindSamplers(places, samplers);
+    gl.uniformMatrix4fv(places.u_clip, false, lamp.clip);
+    this.drawMesh();
   }
 
   // Add the light of at most MOST_LAMPS lamps to an image that was begun.
@@ -142,7 +154,8 @@ class Painter {
     const { gl, header, surface } = this;
     for (const lamp of lamps) {
       lamp.casts = header.traced && !lamp.isAtEye;
-      lamp.clip = lampMatrix(lamp);
+      lamp.camera = lampCamera(lamp);
+      lamp.clip = clipFromWorld(lamp.camera);
     }
     if (header.traced && show === 0) this.drawShadows(lamps);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
@@ -162,8 +175,6 @@ class Painter {
     gl.uniform1i(places.u_show, show);
     gl.uniform3fv(places.u_weight_scale, this.textures.weightScale);
     gl.uniform1f(places.u_alpha, isFirst ? 1 : 0);
-    gl.uniform1f(places.u_lift, header.closed ? 0 : 1e-3);
-    gl.uniform1f(places.u_bias, header.closed ? 1e-6 : 0);
     this.setLamps(places, lamps);
     this.drawMesh();
     gl.disable(gl.BLEND);
@@ -185,11 +196,15 @@ class Painter {
 
   bindTextures(places) {
     const { gl } = this;
-    const all = {
+    this.bindSamplers(places, {
       ...this.textures.samplers,
       u_shadows: { target: gl.TEXTURE_2D_ARRAY, texture: this.shadows.texture },
-    };
-    Object.entries(all).forEach(([name, { target, texture }], number) => {
+    });
+  }
+
+  bindSamplers(places, samplers) {
+    const { gl } = this;
+    Object.entries(samplers).forEach(([name, { target, texture }], number) => {
       gl.activeTexture(gl.TEXTURE0 + number);
       gl.bindTexture(target, texture);
       gl.uniform1i(places[name], number);

@@ -26,6 +26,41 @@ const DEPTH_ONLY = `#version 300 es
 precision mediump float;
 void main() {}`;
 
+// The surface behind the nearest one.
+const DEPTH_BEHIND = `#version 300 es
+precision highp float;
+precision highp sampler2D;
+uniform sampler2D u_nearest;
+void main() {
+  float nearest = texelFetch(u_nearest, ivec2(gl_FragCoord.xy), 0).r;
+  if (gl_FragCoord.z <= nearest + 1e-6) discard;   // 24 bits of depth are 6e-8
+}`;
+
+// Half way between the nearest surface and the one behind it, at most a share of the object's
+// radius behind the nearest.
+const DEPTH_BETWEEN = `#version 300 es
+precision highp float;
+precision highp sampler2D;
+const float MOST = 0.05;
+uniform sampler2D u_nearest;
+uniform sampler2D u_behind;
+uniform vec2 u_range;        // distances of depths 0 and 1
+uniform bool u_is_parallel;
+float distance_of(float depth) {
+  if (u_is_parallel) return mix(u_range.x, u_range.y, depth);
+  return u_range.x * u_range.y / mix(u_range.y, u_range.x, depth);
+}
+float depth_of(float distance) {
+  float share = (distance - u_range.x) / (u_range.y - u_range.x);
+  return u_is_parallel ? share : share * u_range.y / distance;
+}
+void main() {
+  ivec2 place = ivec2(gl_FragCoord.xy);
+  float nearest = distance_of(texelFetch(u_nearest, place, 0).r);
+  float behind = distance_of(texelFetch(u_behind, place, 0).r);
+  gl_FragDepth = depth_of(min(0.5 * (nearest + behind), nearest + MOST));
+}`;
+
 const HEAD = `#version 300 es
 precision highp float;
 precision highp int;
@@ -184,7 +219,6 @@ uniform vec4 u_lamp[MOST_LAMPS];     // position and 1, or direction and 0
 uniform vec3 u_power[MOST_LAMPS];
 uniform mat4 u_shadow_clip[MOST_LAMPS];
 uniform bool u_casts[MOST_LAMPS];    // whether there is a shadow map
-uniform float u_lift, u_bias;
 uniform sampler2D u_covered;
 ivec2 tap_pixel[4];
 float tap_weight[4];
@@ -214,9 +248,9 @@ float reached(int i, vec3 normal, vec3 light) {
   if (!TRACED) return 1.0;
   if (dot(normal, light) <= 0.0) return 0.0;
   if (!u_casts[i]) return 1.0;
-  vec4 clip = u_shadow_clip[i] * vec4(v_position + u_lift * normal, 1.0);
+  vec4 clip = u_shadow_clip[i] * vec4(v_position, 1.0);
   vec3 place = clip.xyz / clip.w * 0.5 + 0.5;
-  return texture(u_shadows, vec4(place.xy, float(i), place.z - u_bias));
+  return texture(u_shadows, vec4(place.xy, float(i), place.z - 1e-6));
 }
 
 vec3 lit_by(int i, vec3 normal, vec3 view) {

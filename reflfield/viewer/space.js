@@ -134,18 +134,18 @@ function anglesOf(frame, direction) {
 }
 
 // Matrix and kind of a lamp's shadow map: what the lamp sees of the unit sphere.
-function lampMatrix(lamp) {
+function lampCamera(lamp) {
   const across = Math.abs(lamp.at[2]) > 0.9 * Math.hypot(...lamp.at) ? [1, 0, 0] : [0, 0, 1];
   if (!lamp.isPoint) {
     const rows = lookingAt(times(lamp.at, 2), [0, 0, 0], across);
-    return clipFromWorld(makeCamera({
+    return makeCamera({
       rows, eye: times(lamp.at, 2), width: 2, height: 2, focal: [0.99, 0.99], centre: [1, 1],
       parallel: true,
-    }));
+    });
   }
   const distance = Math.hypot(...lamp.at), rows = lookingAt(lamp.at, [0, 0, 0], across);
   const focal = 0.99 * Math.sqrt(Math.max(distance * distance - 1, 0.02));
-  return clipFromWorld(makeCamera({
+  return makeCamera({
     rows, eye: lamp.at, width: 2, height: 2, focal: [focal, focal], centre: [1, 1],
-  }));
+  });
 }

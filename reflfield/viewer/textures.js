@@ -194,17 +194,35 @@ function shadowMaps(gl, side, layers) {
   const texture = gl.createTexture();
   gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
   gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, side, side, layers);
-  const parameters = [
-    [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
-    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
-    [gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE], [gl.TEXTURE_COMPARE_FUNC, gl.LEQUAL],
-  ];
-  for (const [name, value] of parameters) gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, value);
+  setParameters(gl, gl.TEXTURE_2D_ARRAY, gl.LINEAR);
+  const compared = [[gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE],
+    [gl.TEXTURE_COMPARE_FUNC, gl.LEQUAL]];
+  for (const [name, value] of compared) gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, value);
   const framebuffers = Array.from({ length: layers }, (_, layer) => {
     const framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, texture, 0, layer);
     return framebuffer;
   });
-  return { texture, framebuffers, side };
+  return { texture, framebuffers, side, nearest: depthTarget(gl, side), behind: depthTarget(gl, side) };
+}
+
+// Depths to be read pixel by pixel.
+function depthTarget(gl, side) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT24, side, side);
+  setParameters(gl, gl.TEXTURE_2D, gl.NEAREST);
+  const framebuffer = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, texture, 0);
+  return { texture, framebuffer };
+}
+
+function setParameters(gl, target, filter) {
+  const parameters = [
+    [gl.TEXTURE_MIN_FILTER, filter], [gl.TEXTURE_MAG_FILTER, filter],
+    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
+  ];
+  for (const [name, value] of parameters) gl.texParameteri(target, name, value);
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from reflfield.field.build import BaseSurface, FittedReflectance, build_field
@@ -37,6 +39,15 @@ def two_spheres(height: int = 24) -> FramedSurface:
             [large.texel_of_pixel, small.texel_of_pixel + n_texels], axis=1
         ),
         base_from_world=np.concatenate([large.base_from_world, small.base_from_world]),
+    )
+
+
+def hourglass(height: int = 48) -> FramedSurface:
+    """A closed surface with a waist, whose upper half shades the slope of the lower one."""
+    ball = sphere_surface(height)
+    across = 0.3 + 0.9 * ball.positions[:, 2:] ** 2
+    return replace(
+        ball, positions=ball.positions * np.concatenate([across, across, 0 * across + 1.3], 1)
     )
 
 

@@ -15,6 +15,7 @@ from reflfield.viewer.object_page import camera_values, light_values, object_pag
 from tests.viewer.shown_fields import (
     clustered_field,
     half_vector_field,
+    hourglass,
     plain,
     planar_field,
     two_spheres,
@@ -94,6 +95,22 @@ def test_is_what_the_library_renders(open_page, name):
         assert np.abs(shown[..., 3] - wanted.coverage).mean() < 1e-3
         # At the edges of shadows, too, few and unbiased.
         assert relative(shown[..., :3] - wanted.image, wanted.image) < 10 * TOLERANCE
+
+
+def test_no_light_leaks_into_the_shadow_of_a_waist(open_page):
+    """Where the light that entered above leaves the object and grazes it again."""
+    field = plain(hourglass())
+    page = open_page(object_page(field))
+    light = rf.DirectionalLight([0.3, 0.0, 1.0], 1.0)
+    for position in ([4.0, -2.5, 0.2], [-4.0, 1.0, 0.2]):
+        camera = view(position)
+        shown, wanted = drawn(page, camera, [light]), render(field, camera, [light], OPTIONS)
+        inside = ndimage.binary_erosion(wanted.coverage == 1, iterations=EDGE_PX)
+        dark = (
+            ndimage.binary_erosion(wanted.image.max(axis=2) == 0, iterations=EDGE_PX) & inside
+        )
+        assert dark.sum() > 50
+        assert shown[..., :3][dark].max() < TOLERANCE * wanted.image.max()
 
 
 def test_an_object_far_away_in_another_unit_is_the_same(open_page):

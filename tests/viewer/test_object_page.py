@@ -34,7 +34,7 @@ from reflfield.viewer.object_page import (
 )
 from reflfield.viewer.page_asset import TABLE_STEPS, packed_block, page_asset
 from reflfield.viewer.page_server import PageServer
-from tests.viewer.shown_fields import half_vector_field, planar_field
+from tests.viewer.shown_fields import half_vector_field
 
 HOSTILE = "</script><script>alert(1)</script>\u202e & \"'<!--"
 
@@ -117,7 +117,6 @@ class TestPacking:
                 np.testing.assert_array_equal(array, field.arrays[name])
         box = QuantisedBox(first["positions"], first["position_box"])
         np.testing.assert_array_equal(box.decode(), field.positions)
-        assert asset.header["closed"]
         assert asset.header["traced"]
 
     def test_indirect_light_is_that_of_the_field_to_half_a_step(self, field):
@@ -134,9 +133,6 @@ class TestPacking:
         names = {entry["name"] for block in asset.blocks for entry in block.entries}
         assert not any(name.startswith("indirect") for name in names)
         assert not asset.header["indirect"]
-
-    def test_a_plane_is_not_closed(self):
-        assert not page_asset(planar_field()).header["closed"]
 
 
 class TestText:
