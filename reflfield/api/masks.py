@@ -99,7 +99,7 @@ def make_masks(
         raise InputError("clean_plate: expected either this or backdrop, received both")
     options = MaskOptions(tuple(parse_colour(text) for text in backdrop), rounds)
     stated = parse_encoding(encoding) if encoding is not None else None
-    views = _Views(capture, clean_plate, ImageReading(encoding=stated))
+    views = _Views(capture, clean_plate, ImageReading(encoding=stated, layer=layer))
     plate = views.plate if clean_plate is not None else None
     names = [views.name(i) for i in range(capture.n_views)]
     out = Path(out)

@@ -24,6 +24,7 @@ from reflfield.capture.documents import parse_count, read_json, read_text
 from reflfield.capture.image_files import AS_STATED, ImageReading
 from reflfield.capture.light_table import light_table_of, with_lights
 from reflfield.capture.masks_beside import with_masks_beside
+from reflfield.capture.names import IMAGE_SUFFIXES
 from reflfield.capture.plausibility import (
     check_code_range,
     differing_exposures,
@@ -181,6 +182,7 @@ def _kind_of_file(path: Path) -> str:
         )
         if fits and reader.recognises(path):
             return format_name
+    _refuse_results(path)
     text = read_text(path)
     if text.lstrip().startswith("{"):
         document = read_json(path)
@@ -199,6 +201,17 @@ def _kind_of_file(path: Path) -> str:
         f"{path}: expected a capture description (capture.json, transforms.json, *_par.txt, "
         f"*.lp or another of the formats in the README), received {json.dumps(text[:40])}"
     )
+
+
+def _refuse_results(path: Path) -> None:
+    """Say that a photograph or a field is no capture."""
+    suffix = path.suffix.lower()
+    if suffix in (*IMAGE_SUFFIXES, ".rfld"):
+        kind = "a field" if suffix == ".rfld" else "a photograph"
+        raise CaptureError(
+            f"{path}: expected a capture, received {kind}; name the folder or the description "
+            "of the capture"
+        )
 
 
 def _refuse_btf(path: Path) -> None:

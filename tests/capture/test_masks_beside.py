@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from reflfield.api.masks import make_masks
+from reflfield.capture.image_files import read_coverage, read_image
 from reflfield.capture.image_writing import write_png
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError
 from tests.capture.calibrations import ring
+from tests.capture.exr_files import write_layers
 
 NAMES = [f"v{i}.png" for i in range(5)]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -57,6 +59,23 @@ def test_masks_named_as_the_photographs_are_read(workspace, ends):
 def test_masks_that_the_command_made_are_those_of_the_next_one(workspace):
     made = make_masks(workspace, workspace / "masks")
     assert list(open_capture(workspace).silhouettes) == [mask.path for mask in made]
+
+
+def test_clean_plates_are_read_from_the_layer_of_the_photographs(workspace):
+    path = workspace / "transforms.json"
+    path.write_text(path.read_text().replace(".png", ".exr"))
+    plain = np.zeros((12, 16), np.float32)
+    for name in (*NAMES, "plate.png"):
+        image = workspace / "images" / name
+        seen = read_image(image)[..., 0] if image.exists() else plain
+        layers = {"one": seen, "two": np.ones_like(plain)}
+        channels = {f"{n}.{c}": a for n, a in layers.items() for c in "RGB"}
+        write_layers(image.with_suffix(".exr"), channels)
+    plate = workspace / "images/plate.exr"
+    made = make_masks(workspace, workspace / "made", clean_plate=plate, layer="one")
+    truth = read_image(workspace / "images/v0.png")[..., 0] > 0
+    covered = read_coverage(made[0].path) > 0.5
+    assert (covered & truth).sum() > 0.8 * (covered | truth).sum()
 
 
 def test_masks_that_the_description_names_count_alone(workspace):

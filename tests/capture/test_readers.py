@@ -445,6 +445,12 @@ class TestDetection:
         with pytest.raises(CaptureError, match=rf"thing\.json.*{reason}"):
             open_capture(path)
 
+    @pytest.mark.parametrize(("name", "kind"), [("a.EXR", "photograph"), ("f.rfld", "field")])
+    def test_photographs_and_fields_are_no_captures(self, tmp_path, name, kind):
+        (tmp_path / name).write_bytes(b"\x76\x2f\x31\x01")
+        with pytest.raises(CaptureError, match=rf"expected a capture, received a {kind}"):
+            open_capture(tmp_path / name)
+
     def test_array_named_as_capture(self, tmp_path):
         (tmp_path / "capture.json").write_text("[1, 2]")
         with pytest.raises(CaptureError, match="JSON object, received list"):
