@@ -95,6 +95,8 @@ def check_capture(capture: Capture) -> Findings:
     findings += code_range_finding(capture) if len(usable) == len(capture.photographs) else ()
     photographs = read_photographs(capture, usable)
     findings += _unreadable(capture, photographs)
+    if not photographs.of:
+        return Findings.sorted(findings, measures(capture))
     checked = list(checked_views(capture, photographs)) if capture.n_views else []
     if capture.base_geometry == PLANE:
         checked = []

@@ -4,6 +4,7 @@ Several faults that do not hide each other share a capture, so that few are chec
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -146,6 +147,18 @@ def test_a_fault_of_the_whole_capture_is_named(name, planted, check_folder, rng)
     fault = FAULTS[name]
     fault.plant(planted, rng)
     assert grave(check_folder(planted.folder)).intersection(fault.kinds)
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_photographs_that_are_all_unreadable_behind_their_headers_are_named(
+    clean_dome, tmp_path, check_folder, left
+):
+    folder = shutil.copytree(clean_dome, tmp_path / "capture")
+    for path in sorted((folder / "photographs").iterdir())[left:]:
+        path.write_bytes(path.read_bytes()[:900])
+    findings = check_folder(folder)
+    kinds = {finding.kind for finding in findings.all if finding.severity == "error"}
+    assert kinds == {"damaged photograph"}
 
 
 def test_the_report_and_the_document_have_the_findings(planted, tmp_path):

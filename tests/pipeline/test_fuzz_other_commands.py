@@ -218,7 +218,12 @@ def places(folder):
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-DAMAGE = st.tuples(st.floats(0, 0.9999), PIECES | st.sampled_from(OTHERS))
+# Which file, what becomes of it, and whether of all of its folder.
+DAMAGE = st.tuples(
+    st.floats(0, 0.9999),
+    PIECES | st.sampled_from(OTHERS),
+    st.sampled_from([False, False, True]),
+)
 
 
 def fresh(folder):
@@ -241,19 +246,22 @@ def described(capture, changes):
 
 @contextmanager
 def damaged(folder, damage):
-    """Within the block, a file of a folder is damaged, or something else."""
-    where, change = damage
+    """Within the block, a file of a folder, or all beside it, are damaged or something else."""
+    where, change, all_beside = damage
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     path = files[int(where * len(files))]
-    content = path.read_bytes()
-    if isinstance(change, str):
-        path.unlink()
-        put(path, change)
-    else:
-        path.write_bytes(mutated_bytes(content, change))
+    spoilt = [p for p in files if p.parent == path.parent] if all_beside else [path]
+    contents = [path.read_bytes() for path in spoilt]
+    for path, content in zip(spoilt, contents, strict=True):
+        if isinstance(change, str):
+            path.unlink()
+            put(path, change)
+        else:
+            path.write_bytes(mutated_bytes(content, change))
     yield
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
-    path.write_bytes(content)
+    for path, content in zip(spoilt, contents, strict=True):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        path.write_bytes(content)
 
 
 def occupy(out, kind):
