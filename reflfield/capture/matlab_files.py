@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
+import warnings
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -51,23 +53,34 @@ def read_matlab(
             "the right file?"
         )
     try:
-        stated = {name: shape for name, shape, _ in matlab.whosmat(str(path))}
-        wanted = [name for name in shapes if name in stated]
-        for name in wanted:
-            _check_shape(path, name, stated[name], shapes[name])
-        loaded = matlab.loadmat(str(path), variable_names=wanted) if wanted else {}
+        with _doubts_as_errors():
+            stated = {name: shape for name, shape, _ in matlab.whosmat(str(path))}
+            wanted = [name for name in shapes if name in stated]
+            for name in wanted:
+                _check_shape(path, name, stated[name], shapes[name])
+            loaded = matlab.loadmat(str(path), variable_names=wanted) if wanted else {}
     except CaptureError:
         raise
     # What SciPy raises on damaged files.
     except (matlab.matlab.MatReadError, OSError, ValueError, TypeError, KeyError, IndexError,
             EOFError, MemoryError, OverflowError, NotImplementedError, AttributeError,
-            AssertionError, struct.error, zlib.error) as error:  # fmt: skip
+            AssertionError, struct.error, zlib.error, UserWarning,
+            RuntimeWarning) as error:  # fmt: skip
         text = " ".join(str(error).split()) or type(error).__name__
         raise CaptureError(
             f"{path}: expected a MATLAB file of version 4 to 7, received a damaged or "
             f"different file ({text[:200]}); save it anew with `save -v7`"
         ) from error
     return {name: _array(path, name, loaded[name]) for name in wanted}
+
+
+@contextmanager
+def _doubts_as_errors() -> Iterator[None]:
+    """SciPy goes on with a warning where what it returns may be wrong."""
+    with warnings.catch_warnings():
+        for category in (UserWarning, RuntimeWarning):
+            warnings.simplefilter("error", category)
+        yield
 
 
 def _check_shape(

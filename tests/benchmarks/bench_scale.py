@@ -144,13 +144,17 @@ def stage_cells(name: str, record: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+# Of stages how long they took, of photographs when they were read.
+TIMES_AND_LOCKS = ("stage.json", "files.json", ".lock")
+
+
 def digests(out: Path) -> dict[str, str]:
     """SHA-256 of the field and of all that the stages made, times and memory left out."""
     files = [path for path in sorted((out / "stages").rglob("*")) if path.is_file()]
     wanted = [
         path
         for path in (out / "field.rfld", *files)
-        if path.name not in ("stage.json", ".lock") and "report" not in path.parts
+        if path.name not in TIMES_AND_LOCKS and "report" not in path.parts
     ]
     sums = {}
     for path in wanted:

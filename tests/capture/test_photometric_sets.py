@@ -269,6 +269,8 @@ def test_damaged_matlab_files(near, tmp_path):
         b"",
         b"x" * 500,
         b"\x89HDF\r\n\x1a\n" + content,
+        b"\x00\x00\x00\x0c" + content,  # version 4 of a size that overflows
+        (2000).to_bytes(4, "little") + content,  # numbers as a VAX has them
     ):
         (tmp_path / "light.mat").write_bytes(damaged)
         with pytest.raises(CaptureError, match=r"light\.mat"):

@@ -72,7 +72,7 @@ def test_the_example_of_the_package_runs_whole(tiny_capture, tmp_path, monkeypat
     """The lines that doctest skips, too, with the capture that they name."""
     shutil.copytree(tiny_capture, tmp_path / "capture")
     monkeypatch.chdir(tmp_path)
-    text = package.__doc__.replace("# doctest: +SKIP", "").replace("27.2", "...")
+    text = package.__doc__.replace("# doctest: +SKIP", "").replace("\n27.2\n", "\n1...\n")
     example = doctest.DocTestParser().get_doctest(text, {}, "reflfield", None, None)
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     assert runner.run(example).failed == 0
