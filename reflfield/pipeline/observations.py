@@ -21,6 +21,7 @@ from reflfield.pipeline.clipped_values import check_measured, clipping_lines, wr
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import writers_at_once
 from reflfield.pipeline.results import ELSEWHERE, SAMPLES
+from reflfield.util.files import naming
 
 
 def write_observations(context: Context, folder: Path) -> dict[str, Any]:
@@ -33,9 +34,9 @@ def write_observations(context: Context, folder: Path) -> dict[str, Any]:
         location,
         context.resources.block_bytes,
     )
-    projected = project_photographs(
-        projection, context.blocks(folder), writers_at_once(context)
-    )
+    blocks = context.blocks(folder)
+    with naming(str(location)):  # the disk of a store may be full, and not that of the results
+        projected = project_photographs(projection, blocks, writers_at_once(context))
     check_measured(context.training, projected)
     write_measured(folder, projected.measured)
     n_samples = len(results.texels(context)) * len(context.training.photographs)

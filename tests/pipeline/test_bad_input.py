@@ -1,7 +1,9 @@
 """Bad input ends with one message that says what is wrong, status 2, and nothing half-made."""
 
+import errno
 import io
 import json
+import os
 import re
 import shutil
 import zipfile
@@ -13,6 +15,7 @@ from PIL import Image
 
 from reflfield.capture.image_files import read_image
 from reflfield.capture.image_writing import write_exr
+from reflfield.pipeline import observations
 
 
 @pytest.fixture
@@ -374,3 +377,16 @@ def test_numbers_beyond_double_are_refused(capture_copy, run_tiny, refused, tmp_
     path.write_text(text)
     outcome = run_tiny(tmp_path / "out", capture=capture_copy)
     refused(outcome, "capture.json", "1e999", "finite", out=tmp_path / "out")
+
+
+def test_a_full_disk_of_a_store_is_not_taken_for_that_of_the_results(
+    run_tiny, tmp_path, monkeypatch
+):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(observations, "project_photographs", full)
+    words = ("--store", tmp_path / "store", "--until", "observations")
+    outcome = run_tiny(tmp_path / "out", *words)
+    assert outcome.status == 2
+    assert re.search(r"error: .*/store/.*: No space left on device", outcome.err)
