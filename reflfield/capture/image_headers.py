@@ -39,7 +39,7 @@ MOST_OVERSCAN = 4
 MOST_PNG_CHUNKS = 10_000
 # Chunks of a PNG whose content is read here, and how much of it.
 PNG_CHUNKS = {b"IHDR": 13, b"gAMA": 4, b"cHRM": 32, b"sRGB": 1, b"cICP": 4, b"eXIf": 1 << 16,
-              b"iCCP": 1 << 23}  # fmt: skip
+              b"iCCP": 1 << 23, b"acTL": 8}  # fmt: skip
 MOST_JPEG_SEGMENTS = 10_000
 LARGEST_RADIANCE_HEADER = 1 << 16
 
@@ -260,6 +260,12 @@ def _png(path: Path, file: IO[bytes]) -> ImageHeader:
         chunks[name] = file.read(kept)
         file.seek(length - kept + 4, os.SEEK_CUR)  # and the checksum
     width, height = struct.unpack(">II", chunks.get(b"IHDR", b"")[:8])
+    n_pictures = int.from_bytes(chunks.get(b"acTL", b"")[:4], "big")
+    if n_pictures > 1:
+        raise CaptureError(
+            f"{path}: expected one picture, received an animation of {n_pictures:,}; save the "
+            "one that is meant as a PNG image of its own"
+        )
     exif = exif_facts(path, chunks.get(b"eXIf", b""))
     colour_type = chunks[b"IHDR"][9]
     alpha = colour_type in (4, 6) or b"tRNS" in chunks

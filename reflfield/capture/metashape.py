@@ -76,7 +76,7 @@ def is_metashape(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        begin = file.read(2000)
+        begin = file.read(4000).replace(b"\0", b"")  # of UTF-16, too
     return b"<document" in begin and b"<chunk" in begin
 
 

@@ -134,6 +134,16 @@ class TestPng:
         np.testing.assert_allclose(read_image(tmp_path / "a.png", said), SHARES, rtol=1e-6)
 
 
+def test_an_animation_is_refused_and_one_of_a_single_picture_read(tmp_path):
+    png_with(tmp_path / "many.png", (b"acTL", struct.pack(">II", 3, 0)))
+    with pytest.raises(CaptureError, match=r"many\.png: expected one picture.* animation of 3"):
+        read_image(tmp_path / "many.png")
+    png_with(tmp_path / "one.png", (b"acTL", struct.pack(">II", 1, 0)))
+    Image.fromarray(STORED).save(tmp_path / "plain.png")
+    plain = read_image(tmp_path / "plain.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "one.png"), plain)
+
+
 class TestProfiles:
     def save(self, path, profile):
         picture = Image.fromarray(np.repeat(STORED, 8, 0).repeat(8, 1))

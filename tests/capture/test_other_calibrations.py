@@ -88,6 +88,13 @@ def test_metashape(project):
     assert "sensors: 'lens' (opencv)" in "\n".join(describe(capture).lines())
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-8-sig"])
+def test_metashape_in_another_encoding(project, tmp_path, encoding):
+    whole = project(metashape(ring()))
+    (tmp_path / "cameras.xml").write_bytes(metashape(ring()).encode(encoding))
+    assert_same_cameras(open_capture(tmp_path).cameras, whole.cameras)
+
+
 @pytest.mark.parametrize("where", ["component", "chunk", "both"])
 def test_metashape_scale_and_rotation_of_the_world(project, where):
     rotation, translation, scale = turned(), np.array([3.0, -2.0, 1.0]), 2.5
