@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from reflfield.errors import InputError
 from reflfield.export.blender import write_blender
 from reflfield.export.btf_samples import write_btf_field
-from reflfield.export.gltf import colour_material, write_glb
+from reflfield.export.gltf import colour_material, filled_texture, write_glb
 from reflfield.export.material_maps import export_atlas, gltf_material, material_maps
 from reflfield.export.materialx import write_materialx
 from reflfield.export.mitsuba import write_mitsuba
@@ -19,7 +19,7 @@ from reflfield.export.rti import write_rti
 from reflfield.export.texture_layers import write_texture_layers
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.viewer.object_page import title_of, write_object_page
-from reflfield.viewer.page_asset import texel_image
+from reflfield.viewer.page_asset import texel_colours
 
 FOLDER = ""  # stands for the suffix of formats that are several files
 
@@ -52,11 +52,12 @@ def _write_glb(path: Path, field: ReflectanceField) -> list[str]:
     """Write the mesh with fitted maps; of a field of unknown light, with its colours alone."""
     atlas = export_atlas(field)
     if field.light_model == "unknown":
-        colours = colour_material(texel_image(field), "in the light of the capture", lit=False)
-        write_glb(path, atlas, colours, title_of(field))
+        image = filled_texture(field.texel_of_pixel, texel_colours(field))
+        colours = colour_material(image, "in the light of the capture", lit=False)
+        write_glb(path, atlas, colours, title_of(field), field.up)
         return ["colours alone, without light: the capture's light is unknown"]
     maps = material_maps(field, atlas)
-    write_glb(path, atlas, gltf_material(maps), title_of(field))
+    write_glb(path, atlas, gltf_material(maps), title_of(field), field.up)
     return maps.lines()
 
 

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from reflfield.errors import InputError
 from reflfield.geometry.mesh import unit_or_zero
@@ -25,6 +27,8 @@ _VERTICES, _INDICES = 34962, 34963  # targets of buffer views: what a GPU binds 
 # glTF holds single precision: beyond so many extents of the mesh from the origin its rounding
 # would exceed a tenth of the step of a field's positions.
 FAR_EXTENTS = 100.0
+# Heights over the extent below which an object counts as flat, and radians that are no turn.
+FLAT_EXTENTS, SMALLEST_TURN = 1e-3, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +85,19 @@ def colour_material(
 
 
 def write_glb(
-    path: Path | str, atlas: Atlas, material: GltfMaterial, name: str = "reflfield"
+    path: Path | str,
+    atlas: Atlas,
+    material: GltfMaterial,
+    name: str = "reflfield",
+    up: ArrayLike = (0.0, 1.0, 0.0),
 ) -> None:
     """Write mesh, normals, tangents, texture coordinates and a material.
 
     Opens in any glTF viewer. Texture coordinates are turned to glTF's convention
-    (v downwards); tangents run along u, their fourth component is -1 in mirrored charts. Of a
-    mesh far from the origin, as in a survey's coordinates, the node's translation holds where
-    its centre is.
+    (v downwards); tangents run along u, their fourth component is -1 in mirrored charts. The
+    node turns the object to stand upright there, where +Y is up; a flat one that is seen from
+    above faces the viewer, +Z. Of a mesh far from the origin, as in a survey's coordinates, the
+    node's translation holds where its centre is.
 
     Parameters
     ----------
@@ -98,6 +107,8 @@ def write_glb(
     material : GltfMaterial
     name : str
         Name of the node and mesh.
+    up : (3,) array_like
+        Direction that is up, in the mesh's coordinates.
 
     References
     ----------
@@ -113,12 +124,22 @@ def write_glb(
     }
     indices = buffer.add(atlas.faces.astype("<u4").ravel(), "SCALAR", target=_INDICES)
     images = [buffer.add_bytes(_png(texture)) for texture in material.textures]
-    document = _document(name, attributes, indices, images, origin)
+    document = _document(name, attributes, indices, images, _placed(atlas.positions, up))
     _add_material(document, material)
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as partial:
         partial.write_bytes(_glb(document | buffer.description(), bytes(buffer.content)))
+
+
+def filled_texture(
+    texel_of_pixel: NDArray[np.integer], values: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Texture (height, width, k) of a value per texel, the nearest one between charts."""
+    nearest = ndimage.distance_transform_edt(
+        texel_of_pixel < 0, return_distances=False, return_indices=True
+    )
+    return np.ascontiguousarray(values[texel_of_pixel[tuple(nearest)]])
 
 
 def far_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,6 +155,19 @@ def far_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     extent = float((high - low).max())
     is_far = np.abs(positions).max() > FAR_EXTENTS * extent
     return 0.5 * (low + high) if is_far else np.zeros(3)
+
+
+def _placed(positions: NDArray[np.float64], up: ArrayLike) -> dict[str, list[float]]:
+    """Rotation and translation of the node; without those that change nothing."""
+    axis = np.asarray(up, dtype=np.float64)
+    axis = axis / np.linalg.norm(axis)
+    heights = (positions - positions.mean(axis=0)) @ axis
+    is_flat = np.ptp(heights) < FLAT_EXTENTS * np.ptp(positions, axis=0).max()
+    turn, _ = Rotation.align_vectors([[0.0, 0.0, 1.0] if is_flat else [0.0, 1.0, 0.0]], [axis])
+    placed = {"rotation": turn.as_quat(), "translation": turn.apply(far_origin(positions))}
+    if turn.magnitude() < SMALLEST_TURN:
+        del placed["rotation"]
+    return {key: value.tolist() for key, value in placed.items() if value.any()}
 
 
 def vertex_tangents(atlas: Atlas) -> NDArray[np.float64]:
@@ -204,12 +238,10 @@ def _document(
     attributes: dict[str, int],
     indices: int,
     images: list[int],
-    origin: NDArray[np.float64],
+    placed: dict[str, list[float]],
 ) -> dict[str, Any]:
     """Scene with one mesh, and textures for its material."""
-    node: dict[str, object] = {"name": name, "mesh": 0}
-    if origin.any():
-        node["translation"] = origin.tolist()
+    node: dict[str, object] = {"name": name, "mesh": 0, **placed}
     primitive = {"attributes": attributes, "indices": indices, "material": 0, "mode": 4}
     return {
         "asset": {"version": "2.0", "generator": "reflfield"},

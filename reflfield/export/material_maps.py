@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from reflfield.capture.encoding import decode_srgb, encode_srgb
 from reflfield.errors import InputError
-from reflfield.export.gltf import GltfMaterial, vertex_tangents
+from reflfield.export.coherent_signs import coherent_signs
+from reflfield.export.gltf import GltfMaterial, filled_texture, vertex_tangents
 from reflfield.export.microfacet_fit import (
     MicrofacetFit,
     direction_pairs,
@@ -161,9 +161,9 @@ def material_maps(field: ReflectanceField, atlas: Atlas) -> MaterialMaps:
     frames = texture_frames(field, atlas)
     exposure = _exposure(field, frames.outward)
     fit = fit_microfacets(field, frames.outward, exposure)
-    texels, factors = _encoded(*_material_of(fit), frames)
+    texels, factors = _encoded(*_material_of(fit), frames, field.texel_of_pixel)
     errors = map_errors(field, _decoded(texels, factors, frames), frames.outward, exposure)
-    images = {name: _image(field, values) for name, values in texels.items()}
+    images = {n: filled_texture(field.texel_of_pixel, v) for n, v in texels.items()}
     return MaterialMaps(
         base_colour=images["base_colour"],
         metallic_roughness=images["metallic_roughness"],
@@ -255,6 +255,7 @@ def _encoded(
     dielectric: Doubles,
     fit: MicrofacetFit,
     frames: TextureFrames,
+    texel_of_pixel: NDArray[np.integer],
 ) -> tuple[dict[str, Bytes], dict[str, float]]:
     """Bytes of each texel by map, and the factors of the maps."""
     level = np.minimum(dielectric.max(axis=1) / DIELECTRIC_F0, 1.0)
@@ -268,14 +269,14 @@ def _encoded(
     normal = frames.coordinates(fit.normals)
     normal[:, 2] = np.maximum(normal[:, 2], _LEAST_NORMAL_Z)
     stretch = frames.coordinates(fit.stretch)
-    stretch[:, 2] = 0.0
+    stretch = unit_or_zero(stretch * [1.0, 1.0, 0.0])[:, :2]
+    stretch *= coherent_signs(stretch, texel_of_pixel)[:, None]
     roughness = np.sqrt(across)
-    direction = 0.5 + 0.5 * unit_or_zero(stretch)[:, :2]
     texels = {
         "base_colour": np.asarray(encode_srgb(base / factors["base_factor"])),
         "metallic_roughness": np.stack([np.ones_like(roughness), roughness, metallic], axis=1),
         "normal": 0.5 + 0.5 * unit_or_zero(normal),
-        "anisotropy": np.column_stack([direction, strength]),
+        "anisotropy": np.column_stack([0.5 + 0.5 * stretch, strength]),
         "specular": np.column_stack([encode_srgb(tint / factors["specular_factor"]), level]),
     }
     return {name: _bytes(values) for name, values in texels.items()}, factors
@@ -335,12 +336,3 @@ def map_errors(
                 np.median(np.sqrt(off / np.maximum(size, 1e-300)))
             )
     return {name: round(value, 4) for name, value in errors.items()}
-
-
-def _image(field: ReflectanceField, values: Bytes) -> Bytes:
-    """Texture of a value per texel, the nearest one between charts."""
-    texels = field.texel_of_pixel
-    nearest = ndimage.distance_transform_edt(
-        texels < 0, return_distances=False, return_indices=True
-    )
-    return np.ascontiguousarray(values[texels[tuple(nearest)]])

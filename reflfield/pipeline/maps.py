@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_writing import write_exr
-from reflfield.export.gltf import colour_material, write_glb
+from reflfield.export.gltf import colour_material, filled_texture, write_glb
 from reflfield.field.file import open_field
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.held_out_photographs import mean_sample
@@ -75,7 +75,7 @@ def _write_mesh(context: Context, average: NDArray[np.float32], folder: Path) ->
     known = np.nan_to_num(average)
     white = np.percentile(known.max(axis=1), 99) or 1.0
     texels = results.texels(context).texel_of_pixel
-    image = encode_srgb(np.clip(known / white, 0, 1))[np.maximum(texels, 0)]
-    image = np.where(texels[..., None] >= 0, image, 0)
-    material = colour_material(np.rint(image * 255).astype(np.uint8))
-    write_glb(folder / "atlas.glb", results.atlas(context), material)
+    colours = np.rint(encode_srgb(np.clip(known / white, 0, 1)) * 255).astype(np.uint8)
+    material = colour_material(filled_texture(texels, colours))
+    up = context.capture.up
+    write_glb(folder / "atlas.glb", results.atlas(context), material, up=up)

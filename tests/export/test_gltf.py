@@ -9,7 +9,12 @@ import trimesh
 from PIL import Image
 
 from reflfield.errors import InputError, ShapeError
-from reflfield.export.gltf import colour_material, vertex_tangents, write_glb
+from reflfield.export.gltf import (
+    colour_material,
+    filled_texture,
+    vertex_tangents,
+    write_glb,
+)
 from reflfield.geometry.uv_atlas import Atlas
 
 # Asymmetric: red top left, green top right, blue bottom left, white bottom right.
@@ -67,6 +72,40 @@ def test_mesh_far_from_the_origin_keeps_its_shape(tmp_path):
     world = relative + np.array(document["nodes"][0]["translation"])
     # To the rounding of doubles of five million.
     assert np.abs(world - (near.positions * 0.1 + far)).max() < 1e-8
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -2], [0, -1, 0], [1, 2, 3]])
+def test_an_object_stands_upright(tmp_path, up):
+    """As trimesh places it: glTF's up is +Y; of a survey's coordinates, too."""
+    tall = replace(quad(), positions=[[0, 0, 0], [1, 0, 2], [1, 1, 4], [0, 3, -5]])
+    for origin in (0.0, 1e6):
+        placed = replace(tall, positions=tall.positions + origin)
+        write_glb(tmp_path / "a.glb", placed, colour_material(TEXTURE), up=up)
+        loaded = trimesh.load_scene(tmp_path / "a.glb").to_geometry()
+        heights = placed.positions @ np.array(up) / np.linalg.norm(up)
+        # Rounding of doubles of the coordinates, of single precision of the object.
+        np.testing.assert_allclose(loaded.vertices[:, 1], heights, atol=1e-6)
+        apart = (
+            np.linalg.norm(np.diff(v, axis=0), axis=1)
+            for v in (loaded.vertices, placed.positions)
+        )
+        np.testing.assert_allclose(*apart, atol=1e-6)
+
+
+def test_a_flat_object_faces_the_viewer(tmp_path):
+    write_glb(tmp_path / "a.glb", quad(), colour_material(TEXTURE), up=[0, 0, 1])
+    assert chunks(tmp_path / "a.glb")[0]["nodes"] == [{"name": "reflfield", "mesh": 0}]
+    turned = replace(quad(), positions=quad().positions[:, [2, 0, 1]], normals=[[1, 0, 0]] * 4)
+    write_glb(tmp_path / "a.glb", turned, colour_material(TEXTURE), up=[1, 0, 0])
+    loaded = trimesh.load_scene(tmp_path / "a.glb").to_geometry()
+    np.testing.assert_allclose(loaded.face_normals, [[0, 0, 1]] * 2, atol=1e-6)
+
+
+def test_a_texture_is_filled_from_the_nearest_texel():
+    texels = np.array([[0, -1, -1, -1, 1]])
+    values = np.array([[10, 20, 30], [40, 50, 60]], np.uint8)
+    filled = filled_texture(texels, values)
+    assert filled[0, [0, 1, 3, 4], 0].tolist() == [10, 10, 40, 40]
 
 
 def test_trimesh_reads_geometry_and_the_texture_the_right_way_up(tmp_path):
