@@ -38,6 +38,8 @@ from reflfield.errors import CaptureError
 from reflfield.util.files import check_regular
 from reflfield.util.quoting import listed
 
+# Images of a folder without a description from which on they may be photographs of one view.
+FEWEST_ALONE = 3
 _logger = logging.getLogger(__name__)
 
 
@@ -156,9 +158,20 @@ def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
     names = READERS if format is None else (format,)
     wanted = ", ".join(READERS[name].patterns[0] for name in names)
     received = ", ".join(str(file.relative_to(folder)) for file, _ in descriptions)
-    remedy = "name the file itself" if descriptions else "is this the capture's own folder?"
+    remedy = "name the file itself" if descriptions else _remedy_without(folder)
     raise CaptureError(
         f"{folder}: expected one of {wanted}, received {received or 'none of them'}; {remedy}"
+    )
+
+
+def _remedy_without(folder: Path) -> str:
+    """What to do about a folder without a description: photographs alone may show the lights."""
+    n_images = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+    if n_images < FEWEST_ALONE:
+        return "is this the capture's own folder?"
+    return (
+        f"it holds {n_images} images alone: nothing tells their cameras and lights. Of one view "
+        "with mirror or glossy spheres in it, `reflfield lights` finds the lights"
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from reflfield.capture import documents
 from reflfield.capture.encoding import encode_srgb
@@ -470,3 +471,15 @@ class TestDetection:
         change = {"pattern": "a\0{camera}{light}"}
         with pytest.raises(CaptureError, match="not a usable path"):
             open_capture(edited(native, lambda d: d.update(photographs=change)))
+
+
+@pytest.mark.parametrize(
+    ("n_images", "reason"), [(2, "own folder"), (4, r"4 images alone.*`reflfield lights`")]
+)
+def test_photographs_alone_are_told_where_their_lights_may_come_from(
+    tmp_path, n_images, reason
+):
+    for number in range(n_images):
+        Image.new("RGB", (4, 3)).save(tmp_path / f"{number}.png")
+    with pytest.raises(CaptureError, match=reason):
+        open_capture(tmp_path)
