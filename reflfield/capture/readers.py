@@ -165,13 +165,13 @@ def _description_in(folder: Path, format: str | None) -> tuple[Path, str]:
 
 
 def _remedy_without(folder: Path) -> str:
-    """What to do about a folder without a description: photographs alone may show the lights."""
+    """What to do about a folder without a description: photographs may show their lights."""
     n_images = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
     if n_images < FEWEST_ALONE:
         return "is this the capture's own folder?"
     return (
-        f"it holds {n_images} images alone: nothing tells their cameras and lights. Of one view "
-        "with mirror or glossy spheres in it, `reflfield lights` finds the lights"
+        f"it holds {n_images} images alone: nothing tells their cameras and lights. Of one "
+        "view with mirror or glossy spheres in it, `reflfield lights` finds the lights"
     )
 
 

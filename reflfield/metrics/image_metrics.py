@@ -97,8 +97,8 @@ class ImageMetrics:
     ssim, flip : float
     n_pixels : int
         Object pixels measured.
-    colour_ratio : tuple of three float or None
-        Relit over photograph per channel; None where the photograph is black.
+    colour_sums : (2, 3) tuple of float
+        Sums of the photograph and of the relit image over the measured pixels, per channel.
     n_excluded : int
         Object pixels left out because the photograph is saturated there.
     silhouette_from : str
@@ -111,9 +111,14 @@ class ImageMetrics:
     ssim: float
     flip: float
     n_pixels: int
-    colour_ratio: tuple[float | None, float | None, float | None]
+    colour_sums: tuple[tuple[float, ...], ...]
     n_excluded: int = 0
     silhouette_from: str = "given"
+
+    @property
+    def colour_ratio(self) -> tuple[float | None, ...]:
+        """Relit over photograph per channel; None where the photograph is black."""
+        return _colour_ratio(*np.asarray(self.colour_sums))
 
     def to_dict(self) -> dict[str, Any]:
         """What ``metrics.json`` says of the photograph; see `Comparison.from_dict`."""
@@ -148,10 +153,11 @@ class Comparison:
 
     @property
     def colour_ratio(self) -> tuple[float | None, ...]:
-        """Mean over photographs of the ratio relit / photograph, per channel."""
-        columns = zip(*(f.colour_ratio for f in self.images), strict=True)
-        kept = [[r for r in column if r is not None] for column in columns]
-        return tuple(float(np.mean(column)) if column else None for column in kept)
+        """Relit over photograph per channel, of the sums over all photographs.
+
+        A mean of ratios would be that of the darkest photographs.
+        """
+        return _colour_ratio(*np.sum([image.colour_sums for image in self.images], axis=0))
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``metrics.json``; see `to_json`."""
@@ -165,7 +171,12 @@ class Comparison:
                 "psnr_cap_db": PSNR_CAP_DB,
                 "colour_ratio": list(self.colour_ratio),
                 "images": [
-                    {"name": f.name, "colour_ratio": list(f.colour_ratio)} for f in self.images
+                    {
+                        "name": f.name,
+                        "colour_ratio": list(f.colour_ratio),
+                        "colour_sums": [list(sums) for sums in f.colour_sums],
+                    }
+                    for f in self.images
                 ],
                 "definitions": dict(DEFINITIONS),
                 "warnings": list(self.warnings),
@@ -188,9 +199,9 @@ class Comparison:
     def from_dict(content: Mapping[str, Any]) -> Comparison:
         """The comparison that `to_dict` has told the content of."""
         extra = content["extra"]
-        ratios = {more["name"]: tuple(more["colour_ratio"]) for more in extra["images"]}
+        sums = {more["name"]: more["colour_sums"] for more in extra["images"]}
         images = tuple(
-            ImageMetrics(**image, colour_ratio=ratios[image["name"]])
+            ImageMetrics(**image, colour_sums=tuple(map(tuple, sums[image["name"]])))
             for image in content["images"]
         )
         return Comparison(
@@ -346,7 +357,7 @@ def measure_image(pair: ImagePair, exposure: float) -> ImageMetrics:
         ssim=sums["ssim"] / n,
         flip=sums["flip"] / n,
         n_pixels=n,
-        colour_ratio=_colour_ratio(*sums["colours"]),
+        colour_sums=tuple(map(tuple, sums["colours"].tolist())),
         n_excluded=int((object_pixels(pair.silhouette) & ~counted).sum()),
         silhouette_from=pair.silhouette_from,
     )

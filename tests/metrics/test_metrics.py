@@ -151,8 +151,18 @@ def test_a_common_scale_changes_nothing(exponent):
         "a", *(x * 2.0**exponent for x in (photograph, pair.relit)), disk(24, 10)
     )
     a, b = compare_images([pair]), compare_images([scaled])
-    assert a.images == b.images
+    assert [one.to_dict() for one in a.images] == [one.to_dict() for one in b.images]
+    assert a.colour_ratio == b.colour_ratio
     assert a.exposure == b.exposure * 2.0**exponent
+
+
+def test_a_dark_photograph_does_not_make_the_ratio(rng):
+    """Of sums over all photographs: one that is hardly lit counts by its light."""
+    bright = rng.uniform(0.5, 1, (24, 24, 3))
+    pairs = [ImagePair("bright", bright, bright, disk(24, 10)),
+             ImagePair("dark", 1e-3 * bright, 5e-4 * bright, disk(24, 10))]  # fmt: skip
+    # Half of a thousandth of the light of both is missing.
+    assert compare_images(pairs).colour_ratio == pytest.approx([1 - 5e-4 / 1.001] * 3, rel=1e-9)
 
 
 def test_backdrop_does_not_matter(frames, rng):

@@ -151,7 +151,7 @@ def _notes_on(comparison: Comparison) -> Note:
         f"All photographs and images are shown at one exposure, {comparison.exposure:.4g}; "
         "none is rescaled. Rows are sorted from the highest to the lowest FLIP error. Look "
         "for missing or smeared highlights, soft or displaced edges of shadows, and double "
-        f"contours. Mean ratio image / photograph, R / G / B: {ratio} (1: no bias). "
+        f"contours. Image / photograph, sums over all, R / G / B: {ratio} (1: no bias). "
         f"{measured_words(comparison)}"
     )
 
