@@ -29,6 +29,8 @@ Floats = NDArray[np.float32]
 SAMPLES_PER_COEFFICIENT = 4
 # Samples of a texel, on average, above which the grids are dense enough.
 MOST_SAMPLES = 4096
+# Beyond what doubles can have, some 310 dB.
+MOST_PSNR = 1000
 
 # Noise and coefficients have at least this share of the largest variance of a coefficient.
 LEAST_SPREAD = 1e-9
@@ -118,14 +120,12 @@ class CompressionOptions:
                     f"{name}: expected at least {least} and at most {most}, "
                     f"received {getattr(self, name)}"
                 )
-        if not 0 <= self.psnr < float("inf"):
-            raise InputError(f"psnr: expected >= 0 dB, received {self.psnr}")
         if self.size and self.psnr:
             raise InputError(
                 f"size, psnr: expected one of them, received {self.size} bytes and "
                 f"{self.psnr} dB"
             )
-        check_ranges(self, {"relative_step": (1e-3, 1e3)})
+        check_ranges(self, {"psnr": (0, MOST_PSNR), "relative_step": (1e-3, 1e3)})
 
     @property
     def clusters(self) -> int:

@@ -15,6 +15,7 @@ from reflfield.pipeline.cache import RECORD, StageFolder
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.util.checksums import checksums, first_damaged
 from reflfield.util.folders import LOCK, only_run
+from tests.pipeline.test_fuzz_commands import OPTIONS
 
 DIGITS = "9" * 5000
 
@@ -84,6 +85,15 @@ def test_option_beyond_its_range_is_refused(setting):
     name = re.escape(setting.partition("=")[0])
     with pytest.raises(InputError, match=rf"option {name}: expected .*, received"):
         with_tables(PipelineOptions(), parse_settings([setting]))
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_number_has_a_range(name):
+    """Of text, lists and choices a number is refused as such."""
+    beyond = 2**63 if name == "seed" else 10**17
+    for value in (beyond, -beyond, float(beyond)):
+        with pytest.raises(InputError, match=rf"option '?{re.escape(name)}'?: expected"):
+            with_tables(PipelineOptions(), parse_settings([f"{name}={value}"]))
 
 
 class TestNoRegularFiles:
