@@ -40,6 +40,7 @@ for command in (
 ):
     app.command()(command)
 LONGEST_MESSAGE = 1600
+LESS_MEMORY = "end other programs, or lower --workers and --max-memory"
 
 
 def main() -> None:
@@ -54,6 +55,8 @@ def main() -> None:
         fail(with_flags(str(error)), error)
     except OSError as error:  # a folder that cannot be written, a full disk
         fail(system_words(error), error)
+    except MemoryError as error:
+        fail(f"memory: expected more than is free ({error or 'none'}); {LESS_MEMORY}", error)
     finally:
         notes.removeHandler(handler)
         notes.propagate = True

@@ -96,6 +96,19 @@ class TestExitStatus:
             reflfield("run", tiny_capture, "-o", tmp_path / "out")
         assert not (tmp_path / "out" / "stages" / "hull.partial").exists()
 
+    def test_memory_that_the_system_refuses_is_one_message(
+        self, reflfield, tiny_capture, monkeypatch, tmp_path
+    ):
+        monkeypatch.setattr(
+            "reflfield.pipeline.hull.visual_hull", lambda *_, **__: np.zeros(1 << 50)
+        )
+        outcome = reflfield("run", tiny_capture, "-o", tmp_path / "out")
+        assert outcome.status == 2
+        (said,) = outcome.err.splitlines()
+        assert said.startswith("reflfield: error: memory: expected more than is free (Unable")
+        assert "--max-memory" in said
+        assert not (tmp_path / "out" / "stages" / "hull.partial").exists()
+
 
 class TestProgress:
     def test_lines_say_how_much_is_left_and_not_too_often(self):
