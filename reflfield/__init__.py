@@ -56,7 +56,6 @@ if _TYPE_CHECKING:
         FieldFileError,
         GeometryError,
         InputError,
-        NumericalError,
         ReflfieldError,
         ShapeError,
     )
@@ -108,7 +107,6 @@ __all__ = [
     "IndirectOptions",
     "InputError",
     "Light",
-    "NumericalError",
     "PipelineOptions",
     "PointLight",
     "RefinementOptions",
@@ -157,7 +155,7 @@ _MODULES = {
     "reflfield.capture.lights": ("DirectionalLight", "Light", "PointLight"),
     "reflfield.errors": (
         *("CaptureError", "FieldFileError", "GeometryError"),
-        *("InputError", "NumericalError", "ReflfieldError", "ShapeError"),
+        *("InputError", "ReflfieldError", "ShapeError"),
     ),
     "reflfield.factorization.svd_completion": ("Completion", "complete"),
     "reflfield.options": ("HoldOut", "Resources"),

@@ -62,6 +62,33 @@ def rounding():
     return tolerance
 
 
+@pytest.fixture
+def order_of_writes(monkeypatch):
+    """Function from a file to what was done: "flushed" to the disk, "named" otherwise.
+
+    Names count that a file got, or another path, such as the folder that it is in.
+    """
+    done = []
+
+    def watched(function, name, inode):
+        def call(first, *more):
+            done.append((name, inode(first)))
+            return function(first, *more)
+
+        return call
+
+    monkeypatch.setattr(os, "fsync", watched(os.fsync, "flushed", lambda f: os.fstat(f).st_ino))
+    for name in ("replace", "rename"):
+        moved = watched(getattr(Path, name), "named", lambda path: path.stat().st_ino)
+        monkeypatch.setattr(Path, name, moved)
+
+    def order(file, named=None):
+        paths = {"flushed": file, "named": named or file}
+        return [what for what, inode in done if inode == paths[what].stat().st_ino]
+
+    return order
+
+
 class Processes:
     """A dask cluster of commands in processes of their own, to be killed.
 

@@ -123,6 +123,18 @@ def test_two_processes_do_not_mix(tmp_path, started):
     assert len(list((out / "photographs").iterdir())) == 64
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_files_are_on_the_disk_before_they_have_their_names(tmp_path, order_of_writes, there):
+    """In an empty folder each is renamed, a new folder with all."""
+    out = tmp_path / "out"
+    if there:
+        out.mkdir()
+    write_capture(scene(), out)
+    for name in tree(out):
+        done = order_of_writes(out / name, named=None if there else out)
+        assert done == (["flushed", "named", "named"] if there else ["flushed", "named"]), name
+
+
 def test_an_empty_folder_keeps_its_identity(tmp_path, capture):
     """It may be where the user stands, or a file system of its own."""
     (tmp_path / "out").mkdir()

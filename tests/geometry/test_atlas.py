@@ -126,7 +126,6 @@ def test_a_quad_is_sampled_at_its_texel_centres(mirrored):
 
 
 @pytest.mark.stability
-@pytest.mark.stability
 def test_texels_far_from_the_origin_stay_apart():
     """Coordinates of a survey: single precision there has steps of half a metre."""
     near = texel_table(quad())

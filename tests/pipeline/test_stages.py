@@ -60,6 +60,12 @@ def test_taken_over_with_a_second_name_for_every_file(folder, other):
     assert [path.name for path in folder.root.iterdir()] == ["sum"]
 
 
+def test_files_are_on_the_disk_before_the_stage_has_its_name(tmp_path, order_of_writes):
+    made = StageFolder(tmp_path).run("sum", write_sum, options=OPTIONS)
+    for name in contents(made):
+        assert order_of_writes(made / name, named=made) == ["flushed", "named"], name
+
+
 def test_another_key_is_computed(folder, other):
     before = contents(other.root / "sum")
     made = folder.run("sum", write_sum, options={"side": 6})

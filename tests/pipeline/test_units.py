@@ -73,7 +73,7 @@ def usual(pictures):
         pytest.param({"length": 2.0**-21}, 1e-3, marks=pytest.mark.slow),
         # Halves round samples otherwise, by 2^-11; two rounds on so coarse grids pass that on
         # to highlights, .03 when this was written.
-        ({"intensity": 1e12, "length": 1e5}, 0.05),
+        ({"intensity": 1e12, "length": 1e6}, 0.05),
         # Whether angles about the normals were known once depended on such roundings.
         ({"intensity": 1.3}, 0.05),
         # Vertices are rounded to a millionth of the ball's radius, and charts are made anew.

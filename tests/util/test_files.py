@@ -116,6 +116,14 @@ def test_a_full_disk_is_named_where_the_system_names_nothing(tmp_path, writing):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("writing", [replacing, filling])
+def test_content_is_on_the_disk_before_it_has_its_name(tmp_path, order_of_writes, writing):
+    with writing(tmp_path / "x") as partial:
+        (partial / "y" if partial.is_dir() else partial).write_text("whole")
+    (file,) = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert order_of_writes(file) == ["flushed", "named"]
+
+
 def test_failed_write_leaves_the_earlier_file(tmp_path):
     path = tmp_path / "x"
     path.write_text("earlier")
