@@ -28,7 +28,7 @@ def encoded(image: np.ndarray, brightest: float) -> Image.Image:
 
 
 def side_by_side(capture_path: Path, run: Path, number: int, size: int) -> Image.Image:
-    """Photograph and rendered image of one held-out frame."""
+    """Photograph and rendered image of one held-out view and light."""
     capture, field = rf.open_capture(capture_path), rf.open_field(run / "field.rfld")
     name = json.loads((run / "metrics.json").read_text())["images"][number]["name"]
     index = [photograph.name for photograph in capture.photographs].index(name)

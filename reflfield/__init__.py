@@ -56,6 +56,7 @@ if _TYPE_CHECKING:
         FieldFileError,
         GeometryError,
         InputError,
+        NumericalError,
         ReflfieldError,
         ShapeError,
     )
@@ -107,6 +108,7 @@ __all__ = [
     "IndirectOptions",
     "InputError",
     "Light",
+    "NumericalError",
     "PipelineOptions",
     "PointLight",
     "RefinementOptions",
@@ -155,7 +157,7 @@ _MODULES = {
     "reflfield.capture.lights": ("DirectionalLight", "Light", "PointLight"),
     "reflfield.errors": (
         *("CaptureError", "FieldFileError", "GeometryError"),
-        *("InputError", "ReflfieldError", "ShapeError"),
+        *("InputError", "NumericalError", "ReflfieldError", "ShapeError"),
     ),
     "reflfield.factorization.svd_completion": ("Completion", "complete"),
     "reflfield.options": ("HoldOut", "Resources"),

@@ -55,6 +55,8 @@ FLAGS = {
     "n_directions": "--directions",
     "photograph_side": "--pixels",
 }
+# These only in backticks: before a colon they are parts of a capture.
+QUOTED_FLAGS = {**FLAGS, "cameras": "--cameras", "lights": "--lights"}
 # Flags that were renamed, old -> new: accepted, with one line, until the next minor version.
 RENAMED_FLAGS = {"--frames": "--capture", "--samples": "--rays-per-pixel"}
 _QUOTED = re.compile(r"`(\w+)(?:=([^`]*))?`")
@@ -72,6 +74,8 @@ def with_flags(message: str) -> str:
     'a.exr: out of the folder; allow it with --follow-links'
     >>> with_flags("hold some out with `hold_out=HoldOut(views=K, lights=K)`")
     'hold some out with --hold-out views=K,lights=K'
+    >>> with_flags("lights: expected one; correct them with `lights=True`")
+    'lights: expected one; correct them with --lights'
     >>> with_flags("light 'l0': start one with `dask scheduler`")
     "light 'l0': start one with `dask scheduler`"
     """
@@ -104,11 +108,11 @@ def current_flags(words: Iterable[str], say: Callable[[str], None]) -> Iterator[
 
 def _flag(quoted: re.Match[str]) -> str:
     name, value = quoted.groups()
-    if name not in FLAGS:
+    if name not in QUOTED_FLAGS:
         return quoted.group()
     if value in (None, "True"):
-        return FLAGS[name]
-    return f"{FLAGS[name]} {_word(value)}"
+        return QUOTED_FLAGS[name]
+    return f"{QUOTED_FLAGS[name]} {_word(value)}"
 
 
 def _word(value: str) -> str:

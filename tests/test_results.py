@@ -81,6 +81,23 @@ def test_readme_is_short():
     assert max(map(len, lines)) < 120
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.parent.name)
+def test_pages_beside_the_code_are_no_longer_than_the_readme(page):
+    assert len(page.read_text().splitlines()) <= 150
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted((ROOT / "tests" / "benchmarks").glob("bench_*.py")),
+    ids=lambda path: path.stem,
+)
+def test_a_benchmark_writes_its_results_and_stands_on_the_page(path):
+    source = path.read_text()
+    assert re.search(r"\bResults\(", source)
+    assert ".write(" in source
+    assert f"tests/benchmarks/{path.name}" in (path.parent / "README.md").read_text()
+
+
 def names_in_table(text):
     """Names in the first column of the first table of a text."""
     table = re.search(r"(^\|.*\n)+", text, re.MULTILINE).group()

@@ -74,7 +74,7 @@ def degrees_of(series: NDArray[np.floating]) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def empty_series(tables: DegreeArrays, like: NDArray[np.floating]) -> ComplexSeries:
-    """Room for a series of the degrees of the tables, in the type of `like`."""
+    """Zeros for a series of the degrees of the tables, in the type of `like`."""
     n_entries, kind = tables.recursion.shape[1], like.dtype
     return ComplexSeries(
         np.zeros(n_entries, kind),

@@ -106,7 +106,7 @@ def find_angles(
     data : SampleSet
         n texels.
     state : SharpAlignment
-        One target; normals within some ten degrees, in-plane angles of no account.
+        One target; normals within some ten degrees, in-plane angles are not used.
     options : RefinementOptions
     n_threads : int
 

@@ -131,10 +131,10 @@ def _trust(value: Any, shown: Any, unit: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _lines(samples: Any, weights: Any, axes: Any, room: Any) -> None:
+def _lines(samples: Any, weights: Any, axes: Any, buffers: Any) -> None:
     """Values shown, and their derivatives by the two tilts, into the last rows of `parts`."""
     _, _, towards, halves = samples
-    parts, slopes, shown = room[0], room[1], room[4]
+    parts, slopes, shown = buffers[0], buffers[1], buffers[4]
     tangent, binormal = axes
     n = len(weights)
     for j in range(len(shown)):
@@ -174,14 +174,14 @@ def _normal_equations(own: Any, trusts: Any, shown: Any, parts: Any, sums: Any) 
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _step(samples: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int) -> Any:
+def _step(samples: Any, view: Any, unit: Any, state: Any, buffers: Any, n_free: int) -> Any:
     """Improve normal and weights once; sum of squares before, and the angle moved."""
     normal, weights = state
     own, counted, _, _ = samples
-    parts, slopes, matrix, right, shown, trusts = room
+    parts, slopes, matrix, right, shown, trusts = buffers
     tangent, binormal = _tangents(normal)
     _terms(normal, view, samples, parts, slopes)
-    _lines(samples, weights, (tangent, binormal), room)
+    _lines(samples, weights, (tangent, binormal), buffers)
     for j in range(len(own)):
         trusts[j] = counted[j] * _trust(own[j], shown[j], unit)
     error = _normal_equations(own, trusts, shown, parts, (matrix, right))
@@ -276,11 +276,11 @@ def _mirror_normal(values: Any, lights: Any, view: Any, least: Any, normal: Any)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _start_weights(samples: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
+def _start_weights(samples: Any, view: Any, unit: Any, state: Any, buffers: Any) -> Any:
     """Set the weights that fit best at a normal; the sum of squares that they leave."""
     normal, weights = state
     own, counted, _, _ = samples
-    parts, slopes, matrix, right, shown, trusts = room
+    parts, slopes, matrix, right, shown, trusts = buffers
     n = len(weights)
     _terms(normal, view, samples, parts, slopes)
     for j in range(len(own)):
@@ -310,38 +310,38 @@ def _brightest(values: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _best_start(samples: Any, view: Any, unit: Any, states: Any, room: Any) -> int:
+def _best_start(samples: Any, view: Any, unit: Any, states: Any, buffers: Any) -> int:
     """Beginning with the least error; -1 if none faces the camera."""
     starts, weights = states
     best, least = -1, np.inf
     for s in range(len(starts)):
         if _facing(starts[s], view) < LEAST_COSINE:
             continue
-        error = _start_weights(samples, view, unit, (starts[s], weights[s]), room)
+        error = _start_weights(samples, view, unit, (starts[s], weights[s]), buffers)
         if error < least:
             best, least = s, error
     return best
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _converge(samples: Any, view: Any, unit: Any, state: Any, room: Any, n_free: int) -> Any:
+def _converge(samples: Any, view: Any, unit: Any, state: Any, buffers: Any, n_free: int) -> Any:
     """Take steps until they are small; the sum of squares before the last."""
     moved, step, error = np.inf, 0, _ZERO
     while moved >= SMALL_STEP and step < MOST_STEPS:
-        error, moved = _step(samples, view, unit, state, room, n_free)
+        error, moved = _step(samples, view, unit, state, buffers, n_free)
         step += 1
     return error
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _matt_fit(samples: Any, view: Any, unit: Any, state: Any, room: Any) -> Any:
+def _matt_fit(samples: Any, view: Any, unit: Any, state: Any, buffers: Any) -> Any:
     """Fit of the matt part alone from the normal of a matt surface; its sum of squares."""
     normal, weights = state
     if _facing(normal, view) < LEAST_COSINE:
         return np.float32(np.inf)
-    _start_weights(samples, view, unit, state, room)
+    _start_weights(samples, view, unit, state, buffers)
     weights[1:] = _ZERO
-    return _converge(samples, view, unit, state, room, 1)
+    return _converge(samples, view, unit, state, buffers, 1)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
@@ -364,7 +364,7 @@ def _fit_texels(values: Any, lights: Any, views: Any, normals: Any, residuals: A
         np.zeros((3, n_lights), np.float32),
         np.zeros((3, n_lights), np.float32),
     )
-    room = (
+    buffers = (
         np.zeros((n + 2, n_lights), np.float32),
         np.zeros((n, 2, n_lights), np.float32),
         np.zeros((n + 2, n + 2)),
@@ -381,16 +381,16 @@ def _fit_texels(values: Any, lights: Any, views: Any, normals: Any, residuals: A
         starts[:] = normals[t]
         _matt_normal(values[t], lights[t], MATT_SHARE * unit, starts[0])
         _mirror_normal(values[t], lights[t], view, HIGHLIGHT_SHARE * unit, starts[1])
-        best = _best_start(samples, view, unit, (starts, weights), room)
+        best = _best_start(samples, view, unit, (starts, weights), buffers)
         if best < 0:
             continue
         state = starts[best], weights[best]
-        residuals[t] = _converge(samples, view, unit, state, room, n)
+        residuals[t] = _converge(samples, view, unit, state, buffers, n)
         if values.shape[1] < FEW_LIGHTS:
             other = (best + 1) % len(starts)
             matt = starts[other], weights[other]
             _matt_normal(values[t], lights[t], MATT_SHARE * unit, matt[0])
-            error = _matt_fit(samples, view, unit, matt, room)
+            error = _matt_fit(samples, view, unit, matt, buffers)
             if _suffices(error, residuals[t], values[t]):
                 best, residuals[t] = other, error
         if _facing(starts[best], view) >= LEAST_COSINE:

@@ -116,7 +116,7 @@ class Placement(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def empty_placement(n: int, side: int) -> Placement:
-    """Room for the placement of n directions."""
+    """Arrays for the placement of n directions."""
     return Placement(
         side,
         np.zeros(n, np.int64),

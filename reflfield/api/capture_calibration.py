@@ -103,8 +103,8 @@ def calibrate(
     """
     if not (cameras or lights or color_checker):
         raise InputError(
-            "calibrate: expected what to correct (cameras, lights, color_checker; of the "
-            "command --cameras, --lights, --color-checker), received nothing"
+            "calibrate: expected what to correct (`cameras=True`, `lights=True`, "
+            "`color_checker`), received nothing"
         )
     if not isinstance(capture, Capture):
         capture = open_capture(

@@ -99,6 +99,8 @@ def compare(
     InputError
         If no photograph can be compared, a file of the capture would be replaced, or the
         memory does not suffice.
+    NumericalError
+        If what the field shows is not finite.
     """
     limits = options or RenderOptions(), resources or Resources()
     fitting = check_relighting_memory(field.stored, capture, *limits, compared=True)

@@ -143,11 +143,11 @@ def options_within(
     ladder, costs = ladder_of(capture), None
     if measured is not None:
         ladder, costs = measured_ladder(Path(measured))
-    choice = choose_within(
+    selected = choose_within(
         *(budget, capture, options or PipelineOptions(), ladder),
         hold_out=hold_out,
         resources=resources,
         costs=costs,
     )
-    log.warning("%s", choice.sentence(budget))
-    return choice.options
+    log.warning("%s", selected.sentence(budget))
+    return selected.options

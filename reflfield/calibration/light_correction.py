@@ -15,9 +15,10 @@ from reflfield.calibration.light_adjustment import (
     adjust_lights,
 )
 from reflfield.capture.capture import PLANE, Capture
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.inspect import spread_evenly
 from reflfield.capture.lights import POINT, Light
-from reflfield.checking.photograph_statistics import LUMINANCE, read_photographs
+from reflfield.checking.photograph_statistics import read_photographs
 from reflfield.checking.shading_fit import nanmedian
 from reflfield.checking.surface_samples import SurfaceSamples, sample_surface
 from reflfield.errors import InputError

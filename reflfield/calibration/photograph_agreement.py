@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
-from reflfield.checking.photograph_statistics import LUMINANCE, PhotographSet, reduced
+from reflfield.capture.color_spaces import LUMINANCE
+from reflfield.checking.photograph_statistics import PhotographSet, reduced
 from reflfield.checking.shading_fit import nanmedian
 from reflfield.checking.surface_samples import SurfaceSamples, sample_surface
 from reflfield.geometry.mesh import Mesh

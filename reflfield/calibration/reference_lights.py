@@ -20,6 +20,7 @@ from reflfield.calibration.sphere_reflections import (
     meeting_point,
 )
 from reflfield.capture.clipping import SATURATED
+from reflfield.capture.color_spaces import luminance
 from reflfield.capture.image_files import AS_STATED, ImageReading, read_kinds
 from reflfield.capture.plausibility import SHORTEST_FOCAL
 from reflfield.errors import InputError
@@ -33,7 +34,6 @@ TABLE, DIRECTIONS = "lights.csv", "lights.lp"
 # Photographs that circles are sought in, evenly spread.
 MOST_SEARCHED = 24
 SUFFIXES = (".exr", ".tif", ".tiff", ".png", ".jpg", ".jpeg", ".hdr", ".cr2", ".nef", ".dng")
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _with_spheres(
     photographs: Sequence[Path], references: References, reading: ImageReading
 ) -> References:
     step = -(-len(photographs) // MOST_SEARCHED)
-    images = [read_kinds(path, reading)[0] @ LUMINANCE for path in photographs[::step]]
+    images = [luminance(read_kinds(path, reading)[0]) for path in photographs[::step]]
     spheres = find_circles([i.astype(np.float32) for i in images], references.n_sought)
     return References(
         tuple(spheres),
@@ -178,8 +178,8 @@ def _light(
     for circle in (*references.spheres, *([matt] if matt else [])):
         circle.check_within(width, height)
     camera = SphereCamera(width, height, references.focal, references.radius)
-    luminance = np.asarray(image @ LUMINANCE, np.float32)
-    rays = [camera.ray_to_light(c, highlight(luminance, c)) for c in references.spheres]
+    bright = luminance(image).astype(np.float32)
+    rays = [camera.ray_to_light(c, highlight(bright, c)) for c in references.spheres]
     position = meeting_point(rays) if len(rays) > 1 else None
     direction, spread = _mean_direction(rays)
     strength: Array | None = None
@@ -193,7 +193,7 @@ def _light(
         direction = direction if rays else shading.direction
     elif references.grey_card is not None:
         strength = card_strength(image, measured, references.grey_card)
-    intensity = None if strength is None else float(strength @ LUMINANCE)
+    intensity = None if strength is None else float(luminance(strength))
     if intensity is not None and position is not None and matt is not None:
         intensity *= float(np.sum(np.square(position - camera.centre_of(matt))))
     return CalibratedLight(name, direction, position, intensity, spread)

@@ -26,6 +26,8 @@ ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 ADOBE_GAMMA = 563 / 256
 # Relative luminance of linear Rec.709, the primaries that all radiance is stored in.
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
+# The same for images in single precision.
+LUMINANCE = np.array(LUMINANCE_WEIGHTS, np.float32)
 # Differences of chromaticities, and of what profiles say, that are rounding.
 SAME_CHROMATICITY = 2e-3
 SAME_MATRIX = 5e-3

@@ -302,7 +302,7 @@ def image_size(path: Path | str, reading: ImageReading | None = None) -> tuple[i
     ----------
     path : Path or str
     reading : ImageReading, optional
-        Says which layer; by default it may be left open, and the first part or page counts.
+        Says which layer; by default the first part or page counts.
 
     Raises
     ------

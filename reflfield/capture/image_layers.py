@@ -28,7 +28,7 @@ COMBINED = frozenset(
     ("combined", "beauty", "rgba", "rgb", "c", "ci", "color", "colour", "composite", "final")
 )
 # What grey images call their one channel. Depth (Z) and the like are none.
-LUMINANCE = frozenset(("y", "l", "v", "i", "r", "gray", "grey", "luminance"))
+LUMINANCE_CHANNELS = frozenset(("y", "l", "v", "i", "r", "gray", "grey", "luminance"))
 MOST_LISTED = 20
 
 
@@ -126,7 +126,7 @@ def _colour(names: dict[str, str]) -> tuple[str, ...]:
         if all(letter in names for letter in letters):
             return tuple(names[letter] for letter in letters)
     others = [letter for letter in names if letter not in ("a", "alpha")]
-    return (names[others[0]],) if len(others) == 1 and others[0] in LUMINANCE else ()
+    return (names[others[0]],) if len(others) == 1 and others[0] in LUMINANCE_CHANNELS else ()
 
 
 def _asked_for(layers: list[Layer], wanted: str) -> list[Layer]:

@@ -41,13 +41,13 @@ def with_masks_beside(capture: Capture, *, follow_links: bool = False) -> Captur
     folders = _folders(capture, follow_links)
     if folders is None:
         return capture
-    found: list[list[Path]] = [[] for _ in capture.cameras]
+    candidates: list[list[Path]] = [[] for _ in capture.cameras]
     for photograph in capture.photographs:
         mask = folders.mask(photograph.path)
-        if mask is not None and mask not in found[photograph.camera]:
-            found[photograph.camera].append(mask)
-    masks = tuple(paths[0] if paths else None for paths in found)
-    notes, details = _notes(folders, found), []
+        if mask is not None and mask not in candidates[photograph.camera]:
+            candidates[photograph.camera].append(mask)
+    masks = tuple(paths[0] if paths else None for paths in candidates)
+    notes, details = _notes(folders, candidates), []
     if any(masks):
         details.append(f"masks in {folders.root / (folders.masks or '')}")
     return replace(
@@ -73,22 +73,22 @@ def _folders(capture: Capture, follow_links: bool) -> ViewFolders | None:
     return ViewFolders(files, images, None)
 
 
-def _notes(folders: ViewFolders, found: Sequence[Sequence[Path]]) -> list[str]:
+def _notes(folders: ViewFolders, candidates: Sequence[Sequence[Path]]) -> list[str]:
     """What is not read of the masks."""
     if folders.masks is None:
         return folders.notes_on_other_masks()
-    where, without = folders.root / folders.masks, sum(not paths for paths in found)
-    if without == len(found):
+    where, without = folders.root / folders.masks, sum(not paths for paths in candidates)
+    if without == len(candidates):
         return [
             f"{where}: not read, since none of its files is named as a photograph (a.jpg.png "
             "or a.png of a.jpg); rename them if they are masks"
         ]
-    several = [paths for paths in found if len(paths) > 1]
-    notes = [f"{where}: no mask for {without} of {len(found)} cameras"] if without else []
+    several = [paths for paths in candidates if len(paths) > 1]
+    notes = [f"{where}: no mask for {without} of {len(candidates)} cameras"] if without else []
     if several:
         names = listed([path.name for path in several[0]])
         notes.append(
-            f"{where}: {len(several)} of {len(found)} cameras have several masks, of which the "
-            f"first is used ({names})"
+            f"{where}: {len(several)} of {len(candidates)} cameras have several masks, of "
+            f"which the first is used ({names})"
         )
     return notes

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.consistency import check_dark_frame, first_uses
 from reflfield.capture.dark_frames import DarkFrame
 from reflfield.checking.findings import ERROR, NOTE, WARNING, Evidence, Finding
-from reflfield.checking.photograph_statistics import KEPT_PIXELS, LUMINANCE, reduced
+from reflfield.checking.photograph_statistics import KEPT_PIXELS, reduced
 from reflfield.checking.shown_images import shown
 from reflfield.errors import InputError
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.checking.findings import ERROR, Finding
-from reflfield.checking.photograph_statistics import LUMINANCE, PhotographSet
+from reflfield.checking.photograph_statistics import PhotographSet
 from reflfield.checking.surface_samples import N_POINTS, SurfaceSamples, with_luminance
 from reflfield.geometry.plane import on_plane
 

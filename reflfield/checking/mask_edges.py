@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.checking.checked_views import CheckedView
-from reflfield.checking.photograph_statistics import LUMINANCE
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]

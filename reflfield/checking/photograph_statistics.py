@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import BLACK, SATURATED, TRANSPARENT
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.image_files import read_small_kinds
 from reflfield.errors import InputError
 from reflfield.options import available_cores
@@ -24,8 +25,6 @@ Float32 = NDArray[np.float32]
 KEPT_PIXELS, MEAN_PIXELS = 128, 512
 # Photographs of a view of which the brightest at a pixel does not count in the mean.
 FEWEST_TRIMMED = 4
-# Luminance of linear Rec.709.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT, Light
 from reflfield.checking.photograph_statistics import (
-    LUMINANCE,
     PhotographSet,
     PhotographStatistics,
 )

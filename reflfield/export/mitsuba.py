@@ -60,7 +60,7 @@ def write_mitsuba(path: Path, field: ReflectanceField) -> list[str]:
         raise InputError(
             f"field: expected a half-vector field of at most {_MOST_TEXELS} texels, received "
             f"one of model {field.model!r} with {field.n_texels}; make one with "
-            "`--set compression.model=half_vector`, or export it `--to gltf`"
+            "`settings=compression.model=half_vector`, or export it with `to='gltf'`"
         )
     options = OrbitOptions(n_images=1, up=tuple(field.up))
     camera = orbit_cameras(field.positions, options)[0]

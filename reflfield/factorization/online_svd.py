@@ -176,8 +176,8 @@ def orthonormal_range(rest: Array, basis: Array, floor: float) -> Array:
     """Orthonormal basis of the residual directions longer than `floor`, (n_rows, k)."""
     q, r = np.linalg.qr(rest)
     vectors, values, _ = np.linalg.svd(r.astype(np.float64))
-    room = len(basis) - basis.shape[1]
-    n_kept = min(int(np.count_nonzero(values > floor)), room)
+    most_new = len(basis) - basis.shape[1]
+    n_kept = min(int(np.count_nonzero(values > floor)), most_new)
     directions = q @ vectors[:, :n_kept].astype(rest.dtype)
     for _ in range(2):
         directions = directions - basis @ (basis.T @ directions)

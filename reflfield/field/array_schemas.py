@@ -131,8 +131,8 @@ def _check_axes(
     name: str, shape: tuple[int, ...], axes: tuple[str | int, ...], lengths: dict[str, int]
 ) -> None:
     fits = len(shape) == len(axes) and all(
-        got == (lengths.setdefault(axis, got) if isinstance(axis, str) else axis)
-        for got, axis in zip(shape, axes, strict=True)
+        length == (lengths.setdefault(axis, length) if isinstance(axis, str) else axis)
+        for length, axis in zip(shape, axes, strict=True)
     )
     if not fits:
         wanted = ", ".join(

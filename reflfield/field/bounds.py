@@ -64,7 +64,7 @@ def raise_top(values: Floats, weights: Floats, channels: Channels, top: Floats) 
     Parameters
     ----------
     values : (n_lights, 3) float32
-        In the domain.
+        Transformed (`observations.texel_samples`).
     weights : (n_lights,) float32
     channels : (n_lights,) uint8
         Bits of those that were measured.

@@ -154,7 +154,7 @@ def _spread_entry(
 
 @numba.njit(cache=True, nogil=True)
 def _empty_corners() -> Any:
-    """Room for the corners of an entry: (nodes, weights) in the lobes and in the table."""
+    """Arrays for the corners of an entry: (nodes, weights) in the lobes and in the table."""
     return (
         (np.zeros(8, np.uint32), np.zeros(8, np.float32)),
         (np.zeros(8, np.uint32), np.zeros(8, np.float32)),

@@ -68,28 +68,31 @@ def completion_error(
     >>> e.unobserved, e.observed
     (0.5, 0.0)
     """
-    got, want = (np.asarray(a, dtype=np.float64) for a in (completed, true))
+    filled, truth = (np.asarray(a, dtype=np.float64) for a in (completed, true))
     seen = np.asarray(observed, dtype=bool)
-    if got.shape != want.shape or got.shape[: seen.ndim] != seen.shape:
+    if filled.shape != truth.shape or filled.shape[: seen.ndim] != seen.shape:
         raise ShapeError(
-            f"completed, true, observed: expected one shape, received {got.shape}, "
-            f"{want.shape}, {seen.shape}"
+            f"completed, true, observed: expected one shape, received {filled.shape}, "
+            f"{truth.shape}, {seen.shape}"
         )
-    seen = np.broadcast_to(seen.reshape(seen.shape + (1,) * (got.ndim - seen.ndim)), got.shape)
-    known = np.isfinite(want)
-    if not np.isfinite(got[known]).all():
+    seen = np.broadcast_to(
+        seen.reshape(seen.shape + (1,) * (filled.ndim - seen.ndim)),
+        filled.shape,
+    )
+    known = np.isfinite(truth)
+    if not np.isfinite(filled[known]).all():
         raise InputError("completed: expected finite samples, received NaN or infinity")
     hidden, measured = known & ~seen, known & seen
     return CompletionError(
-        unobserved=_relative_error(got[hidden], want[hidden]),
-        observed=_relative_error(got[measured], want[measured]),
-        unobserved_cube_root=_relative_error(np.cbrt(got[hidden]), np.cbrt(want[hidden])),
-        observed_cube_root=_relative_error(np.cbrt(got[measured]), np.cbrt(want[measured])),
+        unobserved=_relative_error(filled[hidden], truth[hidden]),
+        observed=_relative_error(filled[measured], truth[measured]),
+        unobserved_cube_root=_relative_error(np.cbrt(filled[hidden]), np.cbrt(truth[hidden])),
+        observed_cube_root=_relative_error(np.cbrt(filled[measured]), np.cbrt(truth[measured])),
         n_unobserved=int(hidden.sum()),
         n_observed=int(measured.sum()),
     )
 
 
-def _relative_error(got: Array, want: Array) -> float:
-    size = float(np.linalg.norm(want))
-    return float(np.linalg.norm(got - want)) / size if size > 0.0 else math.nan
+def _relative_error(filled: Array, truth: Array) -> float:
+    size = float(np.linalg.norm(truth))
+    return float(np.linalg.norm(filled - truth)) / size if size > 0.0 else math.nan

@@ -246,10 +246,10 @@ def frame_errors(
     >>> errors.normal.round(9).tolist(), errors.tangent.round(9).tolist()
     ([0.0, 90.0], [0.0, 0.0])
     """
-    given = np.asarray(local_from_world, dtype=np.float64)
-    check_shape("local_from_world", given, (true.n_texels, 3, 3))
-    true = true.of(np.asarray(np.isfinite(given[true.texel]).all(axis=(1, 2))))
-    frames = given[true.texel]
+    frames = np.asarray(local_from_world, dtype=np.float64)
+    check_shape("local_from_world", frames, (true.n_texels, 3, 3))
+    true = true.of(np.asarray(np.isfinite(frames[true.texel]).all(axis=(1, 2))))
+    frames = frames[true.texel]
     rotations: tuple[UndeterminedRotation, ...] = ()
     tangent = frames[:, 0]
     if targets is not None:

@@ -223,12 +223,12 @@ def metrics_text(compared: Mapping[str, Any] | None, **more: Any) -> str:
     return json.dumps({**kept, **more}, indent=2, allow_nan=False) + "\n"
 
 
-def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
+def common_exposure(photographs: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     """Exposure e of a whole comparison; one pass over the photographs.
 
     Parameters
     ----------
-    pictures : iterable of ((h, w, 3), (h, w))
+    photographs : iterable of ((h, w, 3), (h, w))
         Photograph (linear) and its silhouette; or, instead of the silhouette,
         True for the pixels that count.
 
@@ -250,7 +250,7 @@ def common_exposure(pictures: Iterable[tuple[ArrayLike, ArrayLike]]) -> float:
     4.0
     """
     meter, n_pairs = ExposureMeter(), 0
-    for photograph, silhouette in pictures:
+    for photograph, silhouette in photographs:
         n_pairs += 1
         meter.add(photograph, silhouette)
         del photograph, silhouette  # before the next ones are read
@@ -371,10 +371,10 @@ def _sums(pair: ImagePair, counted: NDArray[np.bool_], exposure: float) -> dict[
         here = counted[own]
         if not here.any():
             continue
-        pictures = without_backdrop(pair, wide)
-        shown = [display(picture, exposure) for picture in pictures]
-        radiance = [picture[inner][here] for picture in pictures]
-        first, second = (picture[inner][here] for picture in shown)
+        images = without_backdrop(pair, wide)
+        shown = [display(image, exposure) for image in images]
+        radiance = [image[inner][here] for image in images]
+        first, second = (image[inner][here] for image in shown)
         sums["ldr"] += float(np.sum((second - first) ** 2))
         first, second = (exposure * values for values in radiance)
         sums["hdr"] += float(np.sum((second - first) ** 2))
@@ -390,7 +390,7 @@ def flip_errors(pair: ImagePair, exposure: float) -> NDArray[np.float32]:
     errors = np.zeros(covered.shape, np.float32)
     for own, wide, inner in strips(*covered.shape):
         if covered[wide].any():
-            shown = [display(picture, exposure) for picture in without_backdrop(pair, wide)]
+            shown = [display(image, exposure) for image in without_backdrop(pair, wide)]
             errors[own] = flip_map(*shown)[inner]
     return errors
 
@@ -461,8 +461,8 @@ def _colour_ratio(
 ) -> tuple[float | None, float | None, float | None]:
     """Of the sums (3,) of both images."""
     red, green, blue = (
-        float(got / want) if want > 0.0 else None
-        for want, got in zip(photograph, relit, strict=True)
+        float(image / measured) if measured > 0.0 else None
+        for measured, image in zip(photograph, relit, strict=True)
     )
     return red, green, blue
 

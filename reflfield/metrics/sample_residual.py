@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.encoding import encode_srgb
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.image_errors import psnr
 from reflfield.observations.image_projection import facing_irradiance
-from reflfield.observations.texel_reading import LUMINANCE, TexelReader
+from reflfield.observations.texel_reading import TexelReader
 
 Floats = NDArray[np.float32]
 

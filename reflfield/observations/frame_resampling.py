@@ -7,7 +7,7 @@ covariance P of a smooth function on the nodes (both directions alike),
 .. math:: X = R_v Y R_l^\top, \quad R = P A^\top (A P A^\top + W^{-1})^{-1},
 
 A being the interpolation from nodes to the texel's directions. Values are
-resampled in the domain of the factorization (cube root by default) after division
+resampled transformed (to their cube root by default) after division
 by the softened cosine of the light.
 
 A node counts as observed as far as directions actually seen lie near it
@@ -78,7 +78,7 @@ class Nodes:
     Parameters
     ----------
     values : (n, n_view_nodes, n_light_nodes, 3) float32
-        In the domain, without the light's cosine; smooth continuation where not observed.
+        Transformed, without the light's cosine; smooth continuation where not observed.
     view_support, light_support : (n, n_nodes) float32
         Share in [0, 1] to which each node was observed.
     pair_support : (n, n_view_nodes, n_light_nodes[, 3]) float32, optional

@@ -129,7 +129,7 @@ def other_light_axes(looks: list[Look]) -> str:
 def _hollow(looks: list[Look], others: float) -> str | None:
     """Words on a hollow that explains the photographs; None where none does.
 
-    Empty where the surface beside it fits the lights as described, which settles it.
+    Empty where the surface beside it fits the lights as described, which decides it.
     """
     normals = np.concatenate([look.normals for look in looks])
     opening = normals.mean(axis=0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
-from reflfield.capture.color_spaces import LUMINANCE_WEIGHTS
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.observations.frame_resampling import (
     Nodes,
     resample,
@@ -38,9 +38,6 @@ from reflfield.sphere.hemisphere import softened_cosine
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
-
-# Rec.709 luminance: what alignment correlates.
-LUMINANCE = np.array(LUMINANCE_WEIGHTS, np.float32)
 
 
 def grid_sides(capture: Capture, options: ResamplingOptions) -> tuple[int, int]:
@@ -199,7 +196,7 @@ class TexelReader:
 
     @property
     def domain_unit(self) -> float:
-        """The samples' unit in the domain of the factorization; a power of two as well."""
+        """The transformed samples' unit; a power of two as well."""
         return float(2.0 ** (np.log2(self.store.unit) / POWERS[self.options.domain]))
 
     @property
@@ -219,7 +216,7 @@ class TexelReader:
 
     @property
     def product_bytes_per_texel(self) -> int:
-        """Memory of one texel's samples in the domain as a product of views and lights."""
+        """Memory of one texel's transformed samples as a product of views and lights."""
         n_views, n_lights = self.capture.n_views, self.capture.n_lights
         return 2 * 12 * n_views * n_lights + 80 * (n_views + n_lights)
 

@@ -16,7 +16,8 @@ from reflfield.alignment.model_arrays import arrays_of_model, model_of_arrays
 from reflfield.alignment.model_fit import FitOptions, fit_model
 from reflfield.alignment.photometric_normals import frames_towards, photometric_normals
 from reflfield.alignment.sample_sources import GriddedSamples, ScatteredSource
-from reflfield.observations.texel_reading import LUMINANCE, TexelReader, luminance_of
+from reflfield.capture.color_spaces import LUMINANCE
+from reflfield.observations.texel_reading import TexelReader, luminance_of
 from reflfield.observations.texel_samples import inverse_transform
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.errors import InputError
 from reflfield.field.build import Quantisation
 from reflfield.field.file import write_field
@@ -53,7 +54,6 @@ from reflfield.fitting.texel_sample_fit import (
 from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.light_agreement import beside_the_view
-from reflfield.observations.texel_reading import LUMINANCE
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context

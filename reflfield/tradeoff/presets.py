@@ -63,8 +63,8 @@ MOST_NODES = 7
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Options that were chosen for a time.
+class PlannedRun:
+    """Options, and what a run with them is expected to take.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ def choose_within(
     hold_out: HoldOut | None = None,
     resources: Resources | None = None,
     costs: UnitCosts | None = None,
-) -> Choice:
+) -> PlannedRun:
     """Choose the best configuration that is expected to end within a time.
 
     Parameters
@@ -156,7 +156,7 @@ def choose_within(
 
     Returns
     -------
-    Choice
+    PlannedRun
 
     Raises
     ------
@@ -165,18 +165,18 @@ def choose_within(
     """
     costs = costs or shipped_costs()
     slower = slowness(machine_seconds(), costs.machine_seconds)
-    share, choices = None, []
+    share, candidates = None, []
     for name, settings in ladder.items():
         changed = with_tables(options, nested(settings))
         context = planned_context(capture, changed, hold_out, resources)
         stages.check(context)
         share = covered_share(context.training) if share is None else share
         plan = plan_of(context, counts_of(context, share), costs, slower)
-        choices.append(Choice(name, changed, plan))
-    for choice in reversed(choices):
-        if choice.plan.seconds <= budget:
-            return choice
-    least = min(choice.plan.seconds for choice in choices)
+        candidates.append(PlannedRun(name, changed, plan))
+    for candidate in reversed(candidates):
+        if candidate.plan.seconds <= budget:
+            return candidate
+    least = min(candidate.plan.seconds for candidate in candidates)
     raise InputError(
         f"budget: expected at least {format_seconds(least)}, which the fastest of "
         f"{', '.join(ladder)} is expected to take, received {format_seconds(budget)}"

@@ -96,14 +96,14 @@ class FileDigests:
         """Write the index, if there is one and anything new in it."""
         if self.index is None or not self._new:
             return
-        settled = {
+        unchanging = {
             name: entry
             for name, entry in self._known.items()
             if entry["at"] - max(entry["state"][1:3]) > TICK_NS
         }
         self.index.parent.mkdir(parents=True, exist_ok=True)
         with replacing(self.index) as partial:
-            partial.write_text(json.dumps(stamped({"files": settled})))
+            partial.write_text(json.dumps(stamped({"files": unchanging})))
         self._new = False
 
 

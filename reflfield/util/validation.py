@@ -58,7 +58,7 @@ def check_shape(
     >>> check_shape("lights", np.zeros((4, 3)), (None, 3))
     """
     fits = array.ndim == len(expected) and all(
-        want is None or want == got for want, got in zip(expected, array.shape, strict=True)
+        n is None or n == length for n, length in zip(expected, array.shape, strict=True)
     )
     if not fits:
         wanted = "(" + ", ".join("any" if n is None else str(n) for n in expected) + ")"

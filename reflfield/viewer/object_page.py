@@ -153,7 +153,7 @@ def object_page(
     if len(text) > most_bytes:
         raise InputError(
             f"page: expected at most {most_bytes:,} bytes, received {len(text):,}; make a "
-            "smaller field with `reflfield run --size`"
+            "smaller field with `size`"
         )
     return text
 

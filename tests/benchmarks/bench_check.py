@@ -3,10 +3,11 @@
     python tests/benchmarks/bench_check.py [CAPTURE ...] [--seeds N]
 
 Without captures, a dome of 36 views and 24 lights is simulated at 128 pixels. Each further
-capture is only checked: it should be clean.
+capture is only checked: it should be clean. Writes results/check.json.
 """
 
 import argparse
+import json
 import sys
 import tempfile
 import time
@@ -14,16 +15,19 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1])]
 
-from capture_sim.scene import parse_scene
-from capture_sim.write import write_capture
-from reflfield.capture.readers import open_capture
-from reflfield.checking.capture_check import check_capture
-from reflfield.checking.findings import NOTE
-from tests.checking import conftest
-from tests.checking.fault_table import FAULTS
-from tests.checking.faults import Planted
+from benchmarks.measuring import Results  # noqa: E402
+
+from capture_sim.scene import parse_scene  # noqa: E402
+from capture_sim.write import write_capture  # noqa: E402
+from reflfield.capture.readers import open_capture  # noqa: E402
+from reflfield.checking.capture_check import check_capture  # noqa: E402
+from reflfield.checking.findings import NOTE  # noqa: E402
+from tests.checking import conftest  # noqa: E402
+from tests.checking.fault_table import FAULTS  # noqa: E402
+from tests.checking.faults import Planted  # noqa: E402
 
 WIDE = {
     **conftest.SCENE,
@@ -58,8 +62,14 @@ def outcome(clean, fault, scratch, seed):
     return bool(grave), is_named, severity, others, seconds
 
 
+def add(results, row):
+    """Print and keep a row."""
+    results.add(row)
+    print(json.dumps(row), flush=True)
+
+
 def main():
-    """Print the table."""
+    """Check, print and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("captures", nargs="*", type=Path)
     parser.add_argument("--seeds", type=int, default=1)
@@ -69,13 +79,14 @@ def main():
         dome = words.dome or Path(folder) / "dome"
         if words.dome is None:
             write_capture(parse_scene(WIDE), dome)
-        print("| clean capture | errors and warnings | CPU |")
-        print("|---|---|---|")
+        results = Results("check", "Planted faults", ["reflfield.checking.capture_check"])
+        results.table("Clean captures")
         for path in (dome, *words.captures):
             findings, seconds = check(path)
             grave = sorted({one.kind for one in findings.all if one.severity != NOTE})
-            print(f"| {path.name} | {', '.join(grave) or 'none'} | {seconds:.1f} s |")
-        print("\n| fault | found | named | severity | also said | CPU |\n" + 6 * "|---" + "|")
+            row = {"capture": path.name, "errors and warnings": ", ".join(grave) or "none"}
+            add(results, {**row, "CPU, s": round(seconds, 1)})
+        results.table("Planted faults")
         for name, fault in FAULTS.items():
             runs = [
                 outcome(dome, fault, Path(folder) / f"{name} {seed}", seed)
@@ -83,11 +94,16 @@ def main():
             ]
             detected, named, severity, others, seconds = zip(*runs, strict=True)
             also = ", ".join(sorted({kind for kinds in others for kind in kinds})) or "nothing"
-            print(
-                f"| {name} | {sum(detected)} of {len(runs)} | {sum(named)} of {len(runs)} | "
-                f"{'/'.join(sorted(set(severity)))} | {also} | {np.mean(seconds):.1f} s |",
-                flush=True,
-            )
+            row = {
+                "fault": name,
+                "found": f"{sum(detected)} of {len(runs)}",
+                "named": f"{sum(named)} of {len(runs)}",
+                "severity": "/".join(sorted(set(severity))),
+                "also said": also,
+                "CPU, s": round(float(np.mean(seconds)), 1),
+            }
+            add(results, row)
+        print(results.write())
 
 
 if __name__ == "__main__":

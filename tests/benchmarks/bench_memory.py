@@ -6,8 +6,8 @@
 A small capture is simulated (4 views under 2 lights) and every pixel made many, so that the
 files are large and the field is small. ``reflfield run``, ``relight`` and ``compare`` then run
 in processes of their own with that ceiling. Peaks are of resident memory, the command and its
-processes together, looked at 20 times a second. Prints only; status 1 if a command fails or
-takes more than it may.
+processes together, looked at 20 times a second. Status 1 if a command fails or takes more
+than it may. Writes results/memory.json.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE.parents[1])]
 
-import psutil
+import psutil  # noqa: E402
+from benchmarks.measuring import Results  # noqa: E402
 
-from capture_sim.scene import parse_scene
-from capture_sim.write import write_capture
-from reflfield.options import gigabytes, parse_bytes
-from reflfield.pipeline.cache import resident_bytes
-from tests.large_captures import enlarged_capture
-from tests.pipeline.conftest import SCENE
+from capture_sim.scene import parse_scene  # noqa: E402
+from capture_sim.write import write_capture  # noqa: E402
+from reflfield.options import gigabytes, parse_bytes  # noqa: E402
+from reflfield.pipeline.cache import resident_bytes  # noqa: E402
+from tests.large_captures import enlarged_capture  # noqa: E402
+from tests.pipeline.conftest import SCENE  # noqa: E402
 
 SETTINGS = ("texture.largest=64", "hull.resolution=32", "relighting.samples_per_pixel=1")
 
@@ -45,6 +47,11 @@ def watched(words):
             break
         time.sleep(0.05)
     return process.wait(), peak
+
+
+def sizes(peak, ceiling):
+    """Cells of a peak and of what was allowed."""
+    return {"peak, GB": round(peak / 2**30, 3), "allowed, GB": round(ceiling / 2**30, 3)}
 
 
 def commands(folder, ceiling, model):
@@ -63,13 +70,15 @@ def commands(folder, ceiling, model):
 
 
 def main():
-    """Simulate, enlarge, run, print."""
+    """Simulate, enlarge, run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--side", type=int, default=4000, help="pixels of a photograph's side")
     parser.add_argument("--max-memory", default="2GB", help="ceiling of every command")
     parser.add_argument("--model", default="half_vector", choices=("half_vector", "clustered"))
     arguments = parser.parse_args()
     ceiling, failed = parse_bytes(arguments.max_memory), False
+    results = Results("memory", "Memory of large photographs", ["reflfield.cli"])
+    results.table(f"Photographs of {arguments.side} x {arguments.side}, {arguments.model}")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_capture(parse_scene(SCENE), folder / "small")
@@ -79,10 +88,14 @@ def main():
             failed |= status != 0 or peak > ceiling
             print(f"{command}: status {status}, at most {gigabytes(peak)} of "
                   f"{gigabytes(ceiling)}", flush=True)  # fmt: skip
+            results.row(command=command, stage="", **sizes(peak, ceiling))
             if command == "run" and status == 0:
                 timings = json.loads((folder / "out" / "timings.json").read_text())
                 for stage in timings["stages"]:
+                    row = sizes(stage["peak_bytes"], ceiling)
+                    results.row(command=command, stage=stage["name"], **row)
                     print(f"  {stage['name']:<22}{stage['peak_bytes'] / 2**30:5.2f} GB")
+    print(results.write())
     return int(failed)
 
 

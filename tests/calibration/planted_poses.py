@@ -83,7 +83,7 @@ class PoseErrors:
     pixels: float
 
 
-class Gauge:
+class PoseErrorMeter:
     """The similarity that brings cameras nearest to the true ones."""
 
     def __init__(self, cameras, truth):
@@ -149,12 +149,12 @@ def main(folder):
         wrong = with_pose_errors(capture, degrees, millimetres, np.random.default_rng(1))
         corrected = correct_cameras(wrong).cameras
         for what, cameras in (("before", wrong.cameras), ("after", corrected)):
-            gauge = Gauge(cameras, capture.cameras)
-            e = gauge.errors()
+            meter = PoseErrorMeter(cameras, capture.cameras)
+            e = meter.errors()
             print(
                 f"| {degrees} deg, {millimetres} mm | {what} | {e.degrees:.3f} deg "
                 f"| {e.millimetres:.2f} mm | {e.pixels:.2f} px "
-                f"| {gauge.hull_iou(silhouettes):.4f} |",
+                f"| {meter.hull_iou(silhouettes):.4f} |",
                 flush=True,
             )
 

@@ -19,7 +19,7 @@ from reflfield.capture.readers import open_capture
 from reflfield.cli import app
 from reflfield.errors import InputError
 from reflfield.geometry.cones import measured_views
-from tests.calibration.planted_poses import Gauge, simulate, with_pose_errors
+from tests.calibration.planted_poses import PoseErrorMeter, simulate, with_pose_errors
 
 # The outlines of these images are drawn to .05 pixel. Two touching planes of each of 66 pairs
 # tell 72 numbers: errors of images after the correction stay below a pixel.
@@ -40,7 +40,10 @@ def silhouettes_of(capture):
 def test_planted_errors_are_removed(dome, degrees, millimetres):
     wrong = with_pose_errors(dome, degrees, millimetres, np.random.default_rng(1))
     correction = correct_cameras(wrong)
-    before, after = Gauge(wrong.cameras, dome.cameras), Gauge(correction.cameras, dome.cameras)
+    before, after = (
+        PoseErrorMeter(wrong.cameras, dome.cameras),
+        PoseErrorMeter(correction.cameras, dome.cameras),
+    )
     assert after.errors().pixels < min(IMAGED_PX, 0.3 * before.errors().pixels)
     silhouettes = silhouettes_of(dome)
     assert before.hull_iou(silhouettes) < 0.96 < after.hull_iou(silhouettes)
@@ -109,7 +112,7 @@ def test_one_wrong_mask_does_little_harm(dome, tmp_path):
     correction = correct_cameras(wrong)
     assert correction.is_kept
     before, after = (
-        Gauge(cameras[1:], dome.cameras[1:]).errors().pixels
+        PoseErrorMeter(cameras[1:], dome.cameras[1:]).errors().pixels
         for cameras in (wrong.cameras, correction.cameras)
     )
     assert after < 0.5 * before
@@ -127,8 +130,8 @@ def test_command(dome, tmp_path):
     assert len(entry["moved"]) == 12
     assert entry["before"]["gap_px"] > 5 * entry["after"]["gap_px"]
     written = open_capture(tmp_path / "out")
-    errors = Gauge(written.cameras, dome.cameras).errors()
-    assert errors.pixels < 0.3 * Gauge(wrong.cameras, dome.cameras).errors().pixels
+    errors = PoseErrorMeter(written.cameras, dome.cameras).errors()
+    assert errors.pixels < 0.3 * PoseErrorMeter(wrong.cameras, dome.cameras).errors().pixels
 
 
 def test_refusals(dome, tmp_path):

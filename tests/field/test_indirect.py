@@ -43,7 +43,7 @@ def planted(rng, n_texels=400, noise=0.01, share=0.4):
 
 
 def domain_values(light, lights):
-    """Values in the domain, negative ones too, (n_texels, n_lights, 3)."""
+    """Transformed values, negative ones too, (n_texels, n_lights, 3)."""
     harmonics = real_harmonics(lights[0], 3)
     weights = np.concatenate(
         [np.ones((len(light.coefficients), 1)), light.coefficients], axis=1

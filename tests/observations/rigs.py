@@ -96,7 +96,7 @@ def random_weights(rng, n, k):
 
 
 def transformed(rng, n, n_views, n_lights, sides, *, pairs=None, values=None):
-    """Samples in the domain at random directions with random weights, a fifth of them zero."""
+    """Transformed samples at random directions with random weights, a fifth of them zero."""
     if values is None:
         values = rng.normal(size=(n, n_views, n_lights, 3)).astype(np.float32)
     return TransformedSamples(

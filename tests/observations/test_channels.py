@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.lights import Light
 from reflfield.observations import frame_resampling
 from reflfield.observations.frame_resampling import (
@@ -18,7 +19,6 @@ from reflfield.observations.resampling_options import (
 )
 from reflfield.observations.store import ObservationStore, Observed, create_samples, note_gaps
 from reflfield.observations.texel_reading import (
-    LUMINANCE,
     NodeColumns,
     TexelReader,
     luminance_of,

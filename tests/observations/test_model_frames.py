@@ -74,7 +74,7 @@ def planted(model, tmp_path, rng):
     lights = reader.luminance(np.arange(N)).lights
     cosine = softened_cosine(lights[..., 2])[:, None, :, None]
     observed = seen.views[:, :, None] & seen.lights[:, None] & seen.pairs.table
-    # What is not observed must have no say, whatever it holds.
+    # What is not observed must be excluded, whatever it holds.
     values = np.where(observed[..., None], cosine * interpolated(taps, nodes) ** 3, 7.0)
     write_samples(tmp_path / "store", capture, values)
     off = Rotation.from_rotvec(SPREAD * rng.normal(size=(N, 3))).as_matrix()

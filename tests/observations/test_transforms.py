@@ -43,7 +43,7 @@ class TestSides:
 
 class TestDomain:
     @given(st.floats(-1e12, 1e12), st.sampled_from(sorted(POWERS)))
-    def test_unroot_inverts_root(self, value, domain):
+    def test_the_inverse_transform_inverts(self, value, domain):
         back = inverse_transform(transform(np.array([value]), domain), domain)
         assert np.allclose(back, value, rtol=1e-14, atol=1e-300)  # a few eps
 
@@ -72,7 +72,7 @@ class TestRooting:
         )
 
     def test_error_of_a_sample_counts_the_same_from_everywhere(self):
-        """A small step dy of the sample is a weighted step of one size in the domain."""
+        """A small step dy of the sample is a weighted step of one transformed size."""
         z, y, step = np.array([0.9, 0.5, 0.2]), 0.3, 1e-6
         for domain, power in POWERS.items():
             at = transform(z * y / z, domain)

@@ -226,7 +226,7 @@ def altered(options, name):
 
 @pytest.mark.parametrize("name", list(options_of(PipelineOptions())))
 def test_options(capture_folder, usual, name):
-    # What shadows are kept for is tested with the choices.
+    # What shadows are kept for is tested with the model selection.
     if name in ("resampling.visibility", "indirect.enabled", "alignment.enabled"):
         return
     expected = TABLES.get(name, TABLES.get(name.partition(".")[0]))

@@ -395,7 +395,7 @@ def test_shadows_show_indirect_light():
         coefficients=np.zeros((16, 0)),
         mean=np.ones((1, 1, 1, 3)),
         basis=np.zeros((1, 0, 1, 1, 3)),
-        # Y_00 = 1 / (2 sqrt(pi)): in the domain .5 for red, .2 for blue.
+        # Y_00 = 1 / (2 sqrt(pi)): transformed .5 for red, .2 for blue.
         indirect=IndirectLight(
             np.array([[[1.0, 0.0, 0.4]]], np.float32) * np.float32(np.sqrt(np.pi)),
             np.zeros((16, 0), np.float32),
