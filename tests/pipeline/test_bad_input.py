@@ -364,10 +364,10 @@ class TestRelightArguments:
 def test_compare_refuses_frames_without_photographs(
     reflfield, refused, finished, tiny_capture, tmp_path
 ):
-    frames = shutil.copytree(tiny_capture, tmp_path / "frames")
-    shutil.rmtree(frames / "photographs")
+    empty = shutil.copytree(tiny_capture, tmp_path / "empty")
+    shutil.rmtree(empty / "photographs")
     out = tmp_path / "out"
-    outcome = reflfield("compare", finished.folder / "field.rfld", frames, "-o", out)
+    outcome = reflfield("compare", finished.folder / "field.rfld", empty, "-o", out)
     refused(outcome, "missing", out=out)
 
 

@@ -25,24 +25,24 @@ def metrics(finished):
 
 def test_black_gets_what_a_black_image_gets(metrics, finished, tiny_capture):
     capture = open_capture(tiny_capture)
-    frames = split_of(capture, HoldOut(1, 1)).compared_capture(capture)
+    compared = split_of(capture, HoldOut(1, 1)).compared_capture(capture)
     stored = json.loads((finished.folder / "stages/comparison/field/heldout.json").read_text())
     exposure = stored["extra"]["exposure"]
-    (frame,) = metrics["baselines"]["black"]["images"]
-    counted = object_pixels(frames.read_silhouette(0))
-    shown = display(frames.read_photograph(0)[counted], exposure)
-    assert frame["name"] == frames.photographs[0].name
-    assert frame["n_pixels"] == counted.sum()
-    assert frame["psnr_ldr"] == pytest.approx(psnr(shown, np.zeros_like(shown)), abs=1e-6)
+    (image,) = metrics["baselines"]["black"]["images"]
+    counted = object_pixels(compared.read_silhouette(0))
+    shown = display(compared.read_photograph(0)[counted], exposure)
+    assert image["name"] == compared.photographs[0].name
+    assert image["n_pixels"] == counted.sum()
+    assert image["psnr_ldr"] == pytest.approx(psnr(shown, np.zeros_like(shown)), abs=1e-6)
 
 
 def test_the_baselines_are_those_of_the_compared_photographs(metrics):
     baselines = metrics["baselines"]
     assert baselines["missing"] == {}
     for name in NAMES:
-        frames = baselines[name]["images"]
-        assert [f["name"] for f in frames] == [f["name"] for f in metrics["images"]]
-        assert [f["n_pixels"] for f in frames] == [f["n_pixels"] for f in metrics["images"]]
+        images = baselines[name]["images"]
+        assert [f["name"] for f in images] == [f["name"] for f in metrics["images"]]
+        assert [f["n_pixels"] for f in images] == [f["n_pixels"] for f in metrics["images"]]
     # A satin ball of one colour: a field, however coarse, is better than nothing.
     assert metrics["mean"]["psnr_ldr"] > baselines["black"]["mean"]["psnr_ldr"] + 6
 
@@ -117,8 +117,8 @@ def test_one_image_of_a_baseline_is_held_at_a_time():
 
     baselines = SimpleNamespace(nearest_to=lambda *_: None, images=images)
     photograph = SimpleNamespace(camera=0, light=0, name="a")
-    frames = SimpleNamespace(photographs=[photograph], cameras=[None], lights=[None])
-    pairs = SimpleNamespace(capture=frames, read=lambda _: None)
+    compared = SimpleNamespace(photographs=[photograph], cameras=[None], lights=[None])
+    pairs = SimpleNamespace(capture=compared, read=lambda _: None)
     scores = SimpleNamespace(add=lambda *_: None)
     analyser = error_analysis.Analyser(baselines, None)
     error_analysis._analyse_one(analyser, pairs, 0, scores, None)

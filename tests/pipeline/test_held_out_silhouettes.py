@@ -1,4 +1,4 @@
-"""Held-out frames are measured on the whole object, whatever they show of it."""
+"""Held-out photographs are measured on the whole object, whatever they show of it."""
 
 import json
 from dataclasses import replace
@@ -50,45 +50,45 @@ def rim(silhouette):
     return int((counted & ~inner).sum())
 
 
-def frames_of(capture, hold_out):
+def compared_of(capture, hold_out):
     return split_of(capture, hold_out).compared_capture(capture)
 
 
-def made(capture, frames, hull, folder):
-    return write_comparison_silhouettes(frames, capture, hull, folder, threads=1)
+def made(capture, compared, hull, folder):
+    return write_comparison_silhouettes(compared, capture, hull, folder, threads=1)
 
 
 class TestWhereTheyComeFrom:
     def test_given_ones_are_taken(self, true_capture, hull, tmp_path):
-        frames = frames_of(true_capture, HoldOut(views=2, lights=2))
-        silhouettes = made(true_capture, frames, hull, tmp_path)
+        compared = compared_of(true_capture, HoldOut(views=2, lights=2))
+        silhouettes = made(true_capture, compared, hull, tmp_path)
         assert silhouettes.origins == ("given", "given")
         for view in range(2):
             np.testing.assert_allclose(
-                silhouettes.read(view), frames.read_silhouette(view), atol=0.5 / 255
+                silhouettes.read(view), compared.read_silhouette(view), atol=0.5 / 255
             )
 
     def test_all_photographs_of_the_camera_make_them(self, true_capture, hull, tmp_path):
-        """One held-out frame shows the lit side alone; all six of its camera the whole."""
+        """One held-out photograph shows the lit side alone; all six of its camera the whole."""
         capture = unmasked(true_capture)
-        frames = frames_of(capture, HoldOut(views=1, lights=1))
-        silhouettes = made(capture, frames, hull, tmp_path)
+        compared = compared_of(capture, HoldOut(views=1, lights=1))
+        silhouettes = made(capture, compared, hull, tmp_path)
         assert silhouettes.origins == ("photographs",)
         truth = true_capture.read_silhouette(5)
         n = int(object_pixels(silhouettes.read(0)).sum())
         assert abs(n - object_pixels(truth).sum()) <= rim(truth)
-        alone = int(object_pixels(frames.read_silhouette(0)).sum())
+        alone = int(object_pixels(compared.read_silhouette(0)).sum())
         assert object_pixels(truth).sum() - alone > rim(truth)
 
     def test_of_a_camera_with_one_photograph_the_hull_is(self, true_capture, hull, tmp_path):
         """Each view has a light of its own: a flash, a hand-held lamp."""
         kept = tuple(p for p in true_capture.photographs if p.light == p.camera % 6)
         capture = replace(unmasked(true_capture), photographs=kept)
-        frames = frames_of(capture, HoldOut(photographs=3))
-        silhouettes = made(capture, frames, hull, tmp_path)
+        compared = compared_of(capture, HoldOut(photographs=3))
+        silhouettes = made(capture, compared, hull, tmp_path)
         assert silhouettes.origins == ("hull",) * 3
         ids = [camera.id for camera in capture.cameras]
-        for view, camera in enumerate(frames.cameras):
+        for view, camera in enumerate(compared.cameras):
             truth = object_pixels(true_capture.read_silhouette(ids.index(camera.id)))
             measured = object_pixels(silhouettes.read(view))
             # The hull of all other views has the outline of the object to the pixel.
@@ -98,10 +98,10 @@ class TestWhereTheyComeFrom:
     def test_in_one_unknown_light_the_photograph_is(self, true_capture, hull, tmp_path):
         one = unmasked(true_capture).subset(lights=[0])
         capture = replace(one, lights=(Light("room", UNKNOWN),))
-        frames = frames_of(capture, HoldOut(views=2))
-        silhouettes = made(capture, frames, hull, tmp_path)
+        compared = compared_of(capture, HoldOut(views=2))
+        silhouettes = made(capture, compared, hull, tmp_path)
         assert silhouettes.origins == ("photographs", "photographs")
-        view = [camera.id for camera in capture.cameras].index(frames.cameras[0].id)
+        view = [camera.id for camera in capture.cameras].index(compared.cameras[0].id)
         expected = capture.read_silhouette(view)
         np.testing.assert_allclose(silhouettes.read(0), expected, atol=0.51 / 255)
 
@@ -111,11 +111,11 @@ class TestWhereTheyComeFrom:
         dark = np.zeros((32, 32, 3), np.float32)
         monkeypatch.setattr(type(true_capture), "read_photograph", lambda *_: dark)
         capture = unmasked(true_capture)
-        frames = frames_of(capture, HoldOut(views=1, lights=1))
-        silhouettes = made(capture, frames, hull, tmp_path)
+        compared = compared_of(capture, HoldOut(views=1, lights=1))
+        silhouettes = made(capture, compared, hull, tmp_path)
         assert silhouettes.origins == ("hull",)
         scene = RayScene(hull, 1)
-        expected = projected_coverage(scene, frames.cameras[0])
+        expected = projected_coverage(scene, compared.cameras[0])
         np.testing.assert_array_equal(silhouettes.read(0), expected)
 
 
@@ -146,9 +146,9 @@ def test_a_dark_held_out_frame_does_not_end_the_run(
     assert (lit["name"], dark["name"]) == ("v005_l001", "v005_l004")
     # As of a view that is not held out: from all its photographs.
     expected = object_pixels(open_capture(capture_copy).read_silhouette(5)).sum()
-    for frame in (dark, lit):
-        assert frame["n_pixels"] + frame["n_excluded"] == expected
-        assert frame["silhouette_from"] == "photographs"
+    for image in (dark, lit):
+        assert image["n_pixels"] + image["n_excluded"] == expected
+        assert image["silhouette_from"] == "photographs"
     assert (dark["n_excluded"], lit["n_excluded"]) == (0, 25)
     assert metrics["measured"]["saturated_pixels_left_out"] == 25
     assert metrics["measured"]["silhouettes"] == {"photographs": 2}

@@ -111,8 +111,8 @@ def test_turns_that_are_none_are_refused(reflfield, ball, tmp_path, words, messa
         ("--orbit", "1", "--light", "0,0,1", "--environment-up", "Z"),
         ("--orbit", "1", "--light", "0,0,1", "--environment-rotation", "0"),
         ("--orbit", "1", "--light", "0,0,1", "--convention", "blender"),
-        ("--capture", "frames.json", "--size", "64"),
-        ("--capture", "frames.json", "--elevation", "10"),
+        ("--capture", "unseen.json", "--size", "64"),
+        ("--capture", "unseen.json", "--elevation", "10"),
     ],
 )
 def test_options_that_would_be_ignored_are_refused(reflfield, ball, tmp_path, words):

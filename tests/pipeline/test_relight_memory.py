@@ -27,8 +27,8 @@ def ball_file(ball, tmp_path_factory):
     return path
 
 
-def frames(folder, width):
-    """One frame without a photograph, square, in front of the ball."""
+def unphotographed(folder, width):
+    """One view without a photograph, square, in front of the ball."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 5.0
     camera = {"w": width, "h": width, "fl_x": width, "fl_y": width, "cx": width / 2,
@@ -66,7 +66,7 @@ def test_frames_beyond_the_ceiling_are_refused(
     reflfield, ball_file, tmp_path, command, width, rng
 ):
     """64 bytes for a pixel to relight, 88 to compare."""
-    where = frames(tmp_path / "frames", width)
+    where = unphotographed(tmp_path / "views", width)
     if command == "compare":
         picture = np.zeros((width, width, 1), np.float32)
         picture[:200] = rng.random((200, width, 1))

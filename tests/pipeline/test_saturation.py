@@ -64,11 +64,11 @@ def error_of(clipped, exposed, tiny_options, folder):
     context = run(
         clipped, folder, options, hold_out=HoldOut(views=1, lights=1), until="compression"
     )
-    frames, unclipped = context.held_out, open_capture(exposed)
+    held_out, unclipped = context.held_out, open_capture(exposed)
     field, squares = open_field(folder / "field.rfld"), []
-    for _ in relight_photographs(field, frames, folder / "relit"):
+    for _ in relight_photographs(field, held_out, folder / "relit"):
         pass
-    for photograph in frames.photographs:
+    for photograph in held_out.photographs:
         index = [p.name for p in unclipped.photographs].index(photograph.name)
         shown = read_image(folder / "relit" / f"{photograph.name}.exr") * WHITE
         squares.append((shown - unclipped.read_photograph(index)) ** 2)

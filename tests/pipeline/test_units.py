@@ -22,7 +22,7 @@ SURVEY = (4.4e5, 1e7, 2345.0)
 
 @pytest.fixture(scope="module")
 def pictures(tiny_capture, tiny_options, tmp_path_factory):
-    """Function from units to what the field makes of four frames, one of them held out.
+    """Function from units to what the field makes of four photographs, one of them held out.
 
     With one cluster: of a ball of one material two would be told apart by rounding.
     """
@@ -48,10 +48,12 @@ def pictures(tiny_capture, tiny_options, tmp_path_factory):
         capture = open_capture(folder / "capture")
         out = folder / "out"
         run(capture, out, options, hold_out=HoldOut(views=1, lights=1), until="compression")
-        frames = capture.subset([0, 5], [1, 3])
-        for _ in relight_photographs(open_field(out / "field.rfld"), frames, folder / "relit"):
+        measured = capture.subset([0, 5], [1, 3])
+        for _ in relight_photographs(
+            open_field(out / "field.rfld"), measured, folder / "relit"
+        ):
             pass
-        names = [photograph.name for photograph in frames.photographs]
+        names = [photograph.name for photograph in measured.photographs]
         return np.stack([read_image(folder / "relit" / f"{name}.exr") for name in names])
 
     return make

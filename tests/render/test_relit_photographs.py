@@ -1,4 +1,4 @@
-"""Relit frames and turntables: files, names, exposure, same bytes."""
+"""Relit photographs and turntables: files, names, exposure, same bytes."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def field():
     return baked_field(sphere_surface(12), lambert([0.8, 0.5, 0.2]), light_side=9)
 
 
-def frames_of(field, names=("a", "b.1", "c")):
+def capture_of(field, names=("a", "b.1", "c")):
     cameras = tuple(orbit_cameras(field.positions, OrbitOptions(n_images=2, size=24)))
     lights = tuple(
         Light(f"l{i}", "point", position=p, intensity=[9, 9, 9])
@@ -35,52 +35,52 @@ def frames_of(field, names=("a", "b.1", "c")):
         Photograph(name, i % 2, (i + 1) % 2, (Exposure(Path("absent.exr")),))
         for i, name in enumerate(names)
     )
-    return Capture("frames", Path(), cameras, lights, photographs)
+    return Capture("three", Path(), cameras, lights, photographs)
 
 
-def test_each_frame_has_its_own_camera_and_light(field, tmp_path):
-    frames = frames_of(field)
-    relit = list(relight_photographs(field, frames, tmp_path / "out", FAST))
-    assert [frame.name for frame in relit] == ["a", "b.1", "c"]
-    for frame, photograph in zip(relit, frames.photographs, strict=True):
-        camera, light = frames.cameras[photograph.camera], frames.lights[photograph.light]
+def test_each_image_has_its_own_camera_and_light(field, tmp_path):
+    capture = capture_of(field)
+    relit = list(relight_photographs(field, capture, tmp_path / "out", FAST))
+    assert [image.name for image in relit] == ["a", "b.1", "c"]
+    for image, photograph in zip(relit, capture.photographs, strict=True):
+        camera, light = capture.cameras[photograph.camera], capture.lights[photograph.light]
         expected = render(field, camera, light, FAST)
-        assert np.array_equal(frame.rendering.image, expected.image)
-        assert np.array_equal(read_image(frame.exr), expected.image)
-        assert np.array_equal(read_coverage(frame.exr), expected.coverage)
+        assert np.array_equal(image.rendering.image, expected.image)
+        assert np.array_equal(read_image(image.exr), expected.image)
+        assert np.array_equal(read_coverage(image.exr), expected.coverage)
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["a.exr", "a.png", "b.1.exr", "b.1.png", "c.exr", "c.png"]
 
 
 def test_pictures_share_one_exposure(field, tmp_path):
-    relit = list(relight_photographs(field, frames_of(field), tmp_path, FAST))
+    relit = list(relight_photographs(field, capture_of(field), tmp_path, FAST))
     meter = ExposureMeter()
-    for frame in relit:
-        meter.add(frame.rendering.image, frame.rendering.coverage)
+    for image in relit:
+        meter.add(image.rendering.image, image.rendering.coverage)
     exposure = meter.exposure
-    for frame in relit:
-        decoded = read_image(frame.png)
-        wanted = np.clip(frame.rendering.image * exposure, 0, 1)
+    for image in relit:
+        decoded = read_image(image.png)
+        wanted = np.clip(image.rendering.image * exposure, 0, 1)
         # Half a step of 8 bits times the steepest slope of the sRGB decoding, 2.28.
         assert np.abs(decoded - wanted).max() < 0.5 / 255 * 2.3
     brightest = read_image(relit[0].png).max()
-    list(relight_photographs(field, frames_of(field), tmp_path, FAST, exposure=exposure / 4))
+    list(relight_photographs(field, capture_of(field), tmp_path, FAST, exposure=exposure / 4))
     assert read_image(relit[0].png).max() < 0.5 * brightest
 
 
-def test_same_frames_give_the_same_bytes(field, tmp_path):
+def test_same_photographs_give_the_same_bytes(field, tmp_path):
     for folder, workers in (("one", 1), ("two", 2)):
         options = RenderOptions(workers=workers, samples_per_pixel=4)
-        list(relight_photographs(field, frames_of(field), tmp_path / folder, options))
+        list(relight_photographs(field, capture_of(field), tmp_path / folder, options))
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
 def test_names_that_collide_or_leave_the_folder_are_refused(field, tmp_path):
     with pytest.raises(InputError, match="received 'a' twice"):
-        next(relight_photographs(field, frames_of(field, ("a", "a")), tmp_path / "x"))
+        next(relight_photographs(field, capture_of(field, ("a", "a")), tmp_path / "x"))
     with pytest.raises(InputError, match="without folders"):
-        next(relight_photographs(field, frames_of(field, ("../a",)), tmp_path / "x"))
+        next(relight_photographs(field, capture_of(field, ("../a",)), tmp_path / "x"))
     assert not (tmp_path / "x").exists()
 
 
