@@ -11,6 +11,7 @@ from typing import Any
 from reflfield.api.captures import open_capture
 from reflfield.calibration.camera_correction import CameraCorrection, correct_cameras
 from reflfield.calibration.color_chart import (
+    GREYS,
     ColorCorrection,
     check_installed,
     color_correction,
@@ -19,12 +20,15 @@ from reflfield.calibration.corrected_photographs import with_colors_corrected
 from reflfield.calibration.light_correction import LightCorrection, correct_lights
 from reflfield.capture.capture import Capture
 from reflfield.capture.conversion import check_empty, convert_capture
-from reflfield.capture.encoding import parse_encoding
+from reflfield.capture.encoding import LINEAR, Encoding, parse_encoding
 from reflfield.capture.image_files import ImageReading, read_image
+from reflfield.capture.image_headers import read_header
 from reflfield.errors import InputError
 from reflfield.util.files import replacing
 
 REPORT = "calibration.json"
+# Image files that hold codes, of which a curve can be told.
+KINDS_OF_CODES = ("png", "jpeg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,8 @@ def calibrate(
     color_checker : Path, optional
         Photograph of a ColorChecker Classic, taken and developed as those of the capture, which
         are then written anew with its white balance and matrix. Needs the extra ``color``.
+        Where its greys are plainly not linear, their curve is written as
+        ``chart_greys.csv``, which `encoding` takes.
     link : bool
         Hard links in place of copies of the photographs, where the file system has them.
     format, encoding, layer, follow_links
@@ -125,6 +131,10 @@ def calibrate(
             capture = replace(capture, lights=of_lights.lights)
         convert_capture(capture, out, link=link)
     calibration = Calibration(open_capture(out), of_cameras, of_lights, of_color)
+    if of_color is not None and of_color.curve:
+        rows = "".join(f"{code},{grey}\n" for code, grey in of_color.curve)
+        with replacing(out / GREYS) as partial:
+            partial.write_text(f"encoded,linear\n{rows}")
     with replacing(out / REPORT) as partial:
         partial.write_text(json.dumps(calibration.entry(), indent=1) + "\n")
     return calibration
@@ -133,4 +143,6 @@ def calibrate(
 def _color(path: Path, encoding: str | None, layer: str | None) -> ColorCorrection:
     check_installed()
     curve = parse_encoding(encoding) if encoding is not None else None
-    return color_correction(read_image(path, ImageReading(curve, layer)), str(path))
+    has_codes = read_header(path).kind in KINDS_OF_CODES
+    codes = read_image(path, ImageReading(Encoding(LINEAR), layer)) if has_codes else None
+    return color_correction(read_image(path, ImageReading(curve, layer)), str(path), codes)

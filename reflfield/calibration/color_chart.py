@@ -5,9 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -33,6 +34,8 @@ MOST_CHARTS = 4
 CLIPPED, FEWEST_PATCHES, FEWEST_GREYS = 0.95, 12, 2
 # Ratio of greys from which on a photograph is plainly not linear.
 LINEAR_GREYS = 1.25
+# File beside the corrected capture, in the form that `encoding` takes.
+GREYS = "chart_greys.csv"
 _WORDS = {
     "matrix": "a matrix",
     "white balance": "the white balance alone, no matrix is better",
@@ -59,6 +62,9 @@ class ColorCorrection:
     grey_scatter : float
         Largest ratio of brightness to reflectance of greys over the least one: 1 where the
         photograph is linear and the chart evenly lit.
+    curve : tuple of (float, float)
+        Where the greys are plainly not linear, and the stored codes are known: pairs of code (a
+        share of the largest) and reflectance, of greys that are not clipped. Else empty.
     error_before, error_balanced, error_after : float
         Mean difference (CIE DE2000) of these patches, at the best common brightness: as
         photographed, with the white balance alone, and with matrices fitted without the patch.
@@ -69,6 +75,7 @@ class ColorCorrection:
     white_balance: Array
     n_used: int
     grey_scatter: float
+    curve: tuple[tuple[float, float], ...]
     error_before: float
     error_balanced: float
     error_after: float
@@ -88,6 +95,7 @@ class ColorCorrection:
                 f"the greys are off by {self.grey_scatter:.1f} times among each other: the "
                 "photograph is not linear, or the chart not evenly lit; develop photographs "
                 "without a tone curve, or state their encoding"
+                + (f": {GREYS} has the curve of the greys" if self.curve else "")
             )
         return lines
 
@@ -99,7 +107,9 @@ class ColorCorrection:
         }
 
 
-def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrection:
+def color_correction(
+    photograph: NDArray[np.floating], name: str, codes: NDArray[np.floating] | None = None
+) -> ColorCorrection:
     """Find a ColorChecker Classic in a photograph and fit a matrix to it.
 
     Parameters
@@ -108,6 +118,8 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
         Linear.
     name : str
         Quoted in messages.
+    codes : (height, width, 3) float, optional
+        The same as stored, as shares of the largest code: tells the curve of greys.
 
     Raises
     ------
@@ -125,7 +137,9 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
     """
     check_installed()
     image = np.asarray(photograph, np.float64)
-    patches = _patches(image / max(float(image.max()), 1e-9), name)
+    corners = _chart(image / max(float(image.max()), 1e-9), name)
+    patches = _sampled(image / max(float(image.max()), 1e-9), corners)
+    stored = None if codes is None else _sampled(np.asarray(codes, np.float64), corners)
     with _library() as colour:
         truth = _reference(colour)
         used: NDArray[np.bool_] = np.all((patches < CLIPPED) & (patches > 0), axis=1)
@@ -138,7 +152,10 @@ def color_correction(photograph: NDArray[np.floating], name: str) -> ColorCorrec
                 f"{FEWEST_GREYS} of its greys, below the upper limit of the photograph, "
                 f"received {used.sum()} and {greys.sum()}; expose it for less time"
             )
-        return _fitted(colour, patches, truth, used, greys)
+        correction = _fitted(colour, patches, truth, used, greys)
+    if stored is None or correction.grey_scatter <= LINEAR_GREYS:
+        return correction
+    return replace(correction, curve=_curve(stored[greys], truth[greys]))
 
 
 def check_installed() -> None:
@@ -166,8 +183,8 @@ def _library() -> Iterator[Any]:
         yield import_module("colour")
 
 
-def _patches(image: Array, name: str) -> Array:
-    """Linear colours (24, 3) of the chart's patches, of a photograph in [0, 1]."""
+def _chart(image: Array, name: str) -> NDArray[np.float32]:
+    """Corners of the one chart in a photograph in [0, 1]."""
     # Its edges are sought in what is as bright as on a screen, then in what is linear.
     charts = _corners(np.asarray(encode_srgb(np.clip(image, 0, 1))))
     charts = charts or _corners(np.clip(image, 0, 1))
@@ -176,7 +193,7 @@ def _patches(image: Array, name: str) -> Array:
             f"{name}: expected one ColorChecker Classic of {N_PATCHES} patches, found "
             f"{len(charts)}; choose a photograph in which it is large, sharp and evenly lit"
         )
-    return _sampled(image, charts[0])
+    return charts[0]
 
 
 def _corners(shown: Array) -> list[NDArray[np.float32]]:
@@ -247,6 +264,7 @@ def _fitted(
         white_balance=balance,
         n_used=int(used.sum()),
         grey_scatter=_grey_scatter(patches[greys], truth[greys]),
+        curve=(),
         error_before=errors["none"],
         error_balanced=errors["white balance"],
         error_after=errors["matrix"],
@@ -256,6 +274,13 @@ def _fitted(
 def _grey_scatter(greys: Array, truth: Array) -> float:
     ratios = greys.mean(axis=1) / truth.mean(axis=1)
     return float(ratios.max() / ratios.min())
+
+
+def _curve(codes: Array, truth: Array) -> tuple[tuple[float, float], ...]:
+    """Rising pairs of code and reflectance of greys, where the codes rise with these."""
+    pairs = sorted(zip(truth.mean(axis=1).tolist(), codes.mean(axis=1).tolist(), strict=True))
+    rises = all(b[1] > a[1] > 0 for a, b in pairwise(pairs))
+    return tuple((round(code, 5), round(grey, 5)) for grey, code in pairs) if rises else ()
 
 
 def _scale(values: Array, wanted: Array) -> float:

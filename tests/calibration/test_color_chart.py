@@ -7,12 +7,14 @@ from importlib.util import find_spec
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from reflfield.calibration import color_chart
 from reflfield.calibration.color_chart import color_correction
 from reflfield.calibration.corrected_photographs import with_colors_corrected
 from reflfield.capture.conversion import convert_capture
+from reflfield.capture.encoding import Encoding, encode_srgb, parse_encoding
 from reflfield.capture.image_files import ImageReading, read_image
 from reflfield.capture.image_writing import write_exr
 from reflfield.capture.readers import open_capture
@@ -70,6 +72,10 @@ def test_matrix_of_the_camera_is_inverted(chart_photograph):
     assert correction.error_after < 1 < correction.error_balanced < correction.error_before
 
 
+def patches(photograph):
+    return color_chart._sampled(photograph, color_chart._chart(photograph, "chart.exr"))
+
+
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_a_chart_that_lies_turned_and_aslant_gives_the_same(chart_photograph, quarters):
     upright = chart_photograph(CAMERA_FROM_LINEAR)
@@ -83,15 +89,15 @@ def test_a_chart_that_lies_turned_and_aslant_gives_the_same(chart_photograph, qu
         flags=cv2.INTER_LINEAR,
         borderValue=(0.25, 0.25, 0.25),
     )
-    turned = color_chart._patches(np.ascontiguousarray(np.rot90(moved, quarters)), "turned")
+    turned = patches(np.ascontiguousarray(np.rot90(moved, quarters)))
     # Means of evenly coloured patches: single precision and OpenCV's 5 bits between pixels.
-    np.testing.assert_allclose(turned, color_chart._patches(upright, "upright"), atol=1e-5)
+    np.testing.assert_allclose(turned, patches(upright), atol=1e-5)
 
 
 def test_two_charts_are_refused(chart_photograph):
     two = np.concatenate([chart_photograph(CAMERA_FROM_LINEAR)] * 2)
     with pytest.raises(InputError, match=r"expected one ColorChecker .* found 2"):
-        color_chart._patches(two, "two.exr")
+        patches(two)
 
 
 def test_clipped_patches_are_left_out(chart_photograph):
@@ -155,6 +161,23 @@ def test_command(dome, chart_photograph, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["capture", "chart.exr", "out"]
 
 
+def test_a_tone_curve_is_told_by_the_greys_and_undone(dome, chart_photograph, tmp_path):
+    linear = chart_photograph(np.diag([0.9, 0.9, 0.9]))
+    # Lifts the middle and rolls off the bright, as cameras do for JPEG files.
+    toned = linear / (linear + 0.3) * 1.3
+    codes = np.rint(255 * np.asarray(encode_srgb(np.clip(toned, 0, 1)))).astype(np.uint8)
+    Image.fromarray(codes).save(tmp_path / "chart.png")
+    convert_capture(dome.subset(views=[0, 1]), tmp_path / "capture", link=True)
+    arguments = ["calibrate", str(tmp_path / "capture"), "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*arguments, "--color-checker", str(tmp_path / "chart.png")])
+    assert done.exit_code == 0, done.output
+    assert "chart_greys.csv has the curve" in done.output
+    curve = parse_encoding(str(tmp_path / "out/chart_greys.csv"))
+    again = color_correction(read_image(tmp_path / "chart.png", ImageReading(curve)), "chart")
+    assert again.grey_scatter < 1.02
+    assert again.curve == ()
+
+
 def test_chart_of_a_museum(shared_data, tmp_path):
     needs_the_extra()
     path = shared_data("mia_rodin_metashape") / "colorchecker_231016_miaEURO_9505.jpg"
@@ -165,3 +188,7 @@ def test_chart_of_a_museum(shared_data, tmp_path):
     np.testing.assert_allclose(correction.white_balance, 1.0, atol=0.05)
     assert correction.grey_scatter > 1.5
     assert "not linear" in correction.lines()[-1]
+    codes = read_image(path, ImageReading(Encoding("linear")))
+    curve = color_correction(read_image(path), path.name, codes).curve
+    assert len(curve) >= 5
+    assert np.diff(curve, axis=0).min() > 0
