@@ -42,7 +42,11 @@ def test_followed_links(reflfield, linked):
     assert "photographs   6, 0 pairs missing" in outcome.out
 
 
-@pytest.mark.parametrize("command", ["run", "inspect", "compare", "relight", "convert"])
+@pytest.mark.parametrize(
+    "command",
+    ["run", "plan", "tradeoff", "inspect", "compare", "relight", "convert", "check", "masks",
+     "calibrate"],
+)  # fmt: skip
 def test_every_command_that_opens_captures_follows_links(reflfield, command):
     assert "--follow-links" in reflfield(command, "--help").out
 

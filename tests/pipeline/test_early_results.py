@@ -51,6 +51,20 @@ def test_the_field_is_there_whatever_fails_later(
     assert open_field(run_copy / "field.rfld").n_texels > 500
 
 
+def test_one_photograph_is_a_result(run_tiny, capture_copy, described, tmp_path):
+    """Of all cameras' silhouettes and what that photograph shows."""
+    only = [{"camera": "v005", "light": "l001", "file": "photographs/v005_l001.exr"}]
+    described(capture_copy, lambda document: document.update(photographs=only))
+    out = tmp_path / "out"
+    outcome = run_tiny(out, *BARE, "--hold-out", "", capture=capture_copy)
+    assert outcome.status == 0, outcome.err
+    assert "9 cameras without a photograph" in outcome.out
+    field = open_field(out / "field.rfld")
+    assert field.metadata["lights"] == 1
+    assert field.n_texels > 500
+    assert (out / "report" / "index.html").is_file()
+
+
 def test_a_camera_without_photographs_is_said_and_worked_around(
     run_tiny, capture_copy, described, tmp_path
 ):

@@ -104,6 +104,21 @@ class TestNoRegularFiles:
         with pytest.raises(InputError, match=r"o\.toml: .* received a named pipe"):
             read_toml(tmp_path / "o.toml")
 
+    @pytest.mark.timeout(60)
+    @pytest.mark.parametrize(
+        ("flag", "name"),
+        [("--on", "a.obj"), ("--on", "a.glb"), ("--environment", "a.exr"),
+         ("--capture", "capture.json")],
+    )  # fmt: skip
+    def test_files_of_a_command(self, reflfield, finished, tmp_path, flag, name):
+        os.mkfifo(tmp_path / name)
+        lit = ("--orbit", "1", "--light", "0,0,1") if flag == "--on" else ()
+        turned = ("--orbit", "1") if flag == "--environment" else ()
+        words = ("relight", finished.folder / "field.rfld", "-o", tmp_path / "out")
+        outcome = reflfield(*words, *lit, *turned, flag, tmp_path / name)
+        assert outcome.status == 2
+        assert f"{name}: expected a file, received a named pipe" in outcome.err
+
     @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda p: p.symlink_to(p.name)])
     @pytest.mark.parametrize("name", [RECORD, "result"])
     def test_file_of_a_stage_is_damaged_and_the_stage_computed_again(
