@@ -26,7 +26,7 @@ class ResamplingOptions:
     visibility : {"factored", "kept", "auto"}
         "factored": samples in cast shadow do not count and shadows are traced again when
         rendering. "kept": shadows are part of the data, as in the paper. "auto" makes both
-        fields and keeps the shadows if that is clearly better on the held-out frames.
+        fields and keeps the shadows if that is clearly better on the held-out photographs.
     """
 
     view_side: int = 0

@@ -157,7 +157,7 @@ class ComparisonOptions:
         and report the error of both: what alignment brings. Takes as long again as the
         compression.
     rate_distortion : bool
-        Quantise the fitted models more and more coarsely, relight the held-out frames from
+        Quantise the fitted models more and more coarsely, relight the held-out photographs from
         each, and draw quality against size. Always done where a size or quality is asked for.
     """
 
