@@ -66,8 +66,8 @@ class CompressionOptions:
         "grid": local PCA of the resampled texels, as in the paper. "samples": from there,
         mean, basis and coefficients are fitted to the samples themselves. "auto" makes
         both fields and takes the one that is clearly better on the held-out photographs.
-        Without any, in doubt, or where a texel has fewer samples than coefficients or thousands of
-        them, their number decides: see `fits_samples`.
+        Without any, in doubt, or where a texel has fewer samples than coefficients or
+        thousands of them, their number decides: see `fits_samples`.
     rank : int
         Rank of the completion in the aligned frames.
     training_texels : int

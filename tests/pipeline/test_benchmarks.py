@@ -1,6 +1,7 @@
 """Benchmarks that no other test runs give the answers that they should, on small sizes."""
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,17 @@ def test_bench_accuracy(subprocess_run, tmp_path):
     assert float(rows["exact"]["normals"]) < 0.5 * float(rows["K=4"]["normals"])
     assert float(rows["exact"]["milliseconds"]) < float(rows["brute force"]["milliseconds"])
     assert np.asarray(Image.open(tmp_path / "accuracy_against_time.png")).std() > 20
+
+
+def test_bench_examples(subprocess_run):
+    words = ("--texels", 60, "--unobserved", 0.3)
+    done = subprocess_run(BENCHMARKS / "bench_examples.py", *words)
+    assert done.status == 0, done.err
+    ((row,),) = [
+        t["rows"] for t in json.loads(Path(done.out.split()[-1]).read_text())["tables"]
+    ]
+    # Tilts of 15 degrees at most, which the tests of the example bound.
+    assert 0 < row["normals off, degrees"] < 0.1 * row["unaligned"] < 1.5
 
 
 @pytest.mark.slow
