@@ -80,3 +80,14 @@ def test_the_check_sees_what_it_must():
     assert repeated({"a.py": "\n".join(one), "b.py": "\n".join(shorter)}) == {}
     text = ['"""', *body, '"""']
     assert repeated({"a.py": "\n".join(text), "b.py": "\n".join(text)}) == {}
+
+
+def test_the_weights_of_luminance_stand_once():
+    holding = [p for p in modules("reflfield") if "(0.2126, " in (ROOT / p).read_text()]
+    holding += [p for p in modules("reflfield") if "[0.2126, " in (ROOT / p).read_text()]
+    assert [path.name for path in holding] == ["color_spaces.py"]
+
+
+def test_ply_files_are_written_in_one_place():
+    writers = [p.name for p in modules("reflfield") if "end_header" in (ROOT / p).read_text()]
+    assert writers == ["mesh.py"]

@@ -77,12 +77,6 @@ def test_old_terms_are_gone():
     assert left - ACCEPTED == set()
 
 
-def test_the_weights_of_luminance_stand_once():
-    holding = [p for p in modules("reflfield") if "(0.2126, " in (ROOT / p).read_text()]
-    holding += [p for p in modules("reflfield") if "[0.2126, " in (ROOT / p).read_text()]
-    assert [path.name for path in holding] == ["color_spaces.py"]
-
-
 def test_the_checks_see_what_they_must():
     source = (
         "def f(given):\n    found = given\n    raise ValueError(f'x: {found}; use `--x-y`')\n"

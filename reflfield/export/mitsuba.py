@@ -25,7 +25,7 @@ from reflfield.field.half_vector import (
     SKEW_RINGS,
 )
 from reflfield.field.reflectance_field import HalfVectorField, ReflectanceField
-from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.mesh import Mesh, ply_bytes
 from reflfield.geometry.texels import frames
 from reflfield.geometry.uv_atlas import Atlas
 from reflfield.render.turntable import OrbitOptions, orbit_cameras
@@ -106,14 +106,5 @@ def _arrays(field: HalfVectorField) -> dict[str, NDArray[np.generic]]:
 
 def _ply(atlas: Atlas, centre: NDArray[np.float64]) -> bytes:
     """Mesh with texture coordinates, around the origin: it is stored in single precision."""
-    names = ("x", "y", "z", "u", "v")
-    vertices = np.hstack([atlas.positions - centre, atlas.uv]).astype("<f4")
-    faces = np.zeros(len(atlas.faces), [("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, atlas.faces
-    header = [
-        *("ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"),
-        *(f"property float {name}" for name in names),
-        *(f"element face {len(faces)}", "property list uchar int vertex_indices"),
-        "end_header\n",
-    ]
-    return "\n".join(header).encode("ascii") + vertices.tobytes() + faces.tobytes()
+    columns = np.hstack([atlas.positions - centre, atlas.uv]).astype(np.float32).T
+    return ply_bytes(dict(zip("xyzuv", columns, strict=True)), atlas.faces)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -354,29 +355,50 @@ def write_ply(path: Path | str, mesh: Mesh) -> None:
     path : Path or str
     mesh : Mesh
     """
-    vertex_type = np.dtype([("position", "<f8", 3), ("normal", "<f4", 3)])
-    face_type = np.dtype([("count", "u1"), ("index", "<i4", 3)])
-    vertices = np.zeros(len(mesh.vertices), vertex_type)
-    vertices["position"], vertices["normal"] = mesh.vertices, mesh.vertex_normals
-    faces = np.zeros(len(mesh.faces), face_type)
-    faces["count"], faces["index"] = 3, mesh.faces
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment metres, right-handed world, counter-clockwise from outside",
-            f"element vertex {len(vertices)}",
-            *(f"property double {axis}" for axis in "xyz"),
-            *(f"property float n{axis}" for axis in "xyz"),
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            "end_header\n",
-        ]
+    properties = dict(zip("xyz", mesh.vertices.T, strict=True))
+    normals = dict(
+        zip(("nx", "ny", "nz"), mesh.vertex_normals.T.astype(np.float32), strict=True)
     )
+    comment = "metres, right-handed world, counter-clockwise from outside"
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as partial:
-        partial.write_bytes(header.encode("ascii") + vertices.tobytes() + faces.tobytes())
+        partial.write_bytes(ply_bytes(properties | normals, mesh.faces, comment))
+
+
+def ply_bytes(properties: Mapping[str, NDArray[Any]], faces: Faces, comment: str = "") -> bytes:
+    """Content of a binary PLY file.
+
+    Parameters
+    ----------
+    properties : mapping of str to (n,) float32 or float64
+        Of the vertices.
+    faces : (m, 3) int32
+    comment : str
+    """
+    kinds = {
+        name: "double" if v.dtype == np.float64 else "float" for name, v in properties.items()
+    }
+    stored = {"double": "<f8", "float": "<f4"}
+    count = len(next(iter(properties.values())))
+    vertices = np.zeros(count, [(name, stored[kind]) for name, kind in kinds.items()])
+    for name, values in properties.items():
+        vertices[name] = values
+    corners = np.zeros(len(faces), [("count", "u1"), ("index", "<i4", 3)])
+    corners["count"], corners["index"] = 3, faces
+    header = [
+        *(
+            "ply",
+            "format binary_little_endian 1.0",
+            *([f"comment {comment}"] if comment else []),
+        ),
+        f"element vertex {count}",
+        *(f"property {kind} {name}" for name, kind in kinds.items()),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    return "\n".join(header).encode("ascii") + vertices.tobytes() + corners.tobytes()
 
 
 def read_ply(path: Path | str) -> Mesh:
