@@ -89,5 +89,7 @@ def test_the_weights_of_luminance_stand_once():
 
 
 def test_ply_files_are_written_in_one_place():
-    writers = [p.name for p in modules("reflfield") if "end_header" in (ROOT / p).read_text()]
+    writers = [
+        p.name for p in modules("reflfield") if "element vertex" in (ROOT / p).read_text()
+    ]
     assert writers == ["mesh.py"]
