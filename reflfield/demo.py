@@ -32,14 +32,14 @@ OPTIONS = PipelineOptions(
 COMPILE = f"from {compile_kernels.__module__} import compile_kernels; compile_kernels()"
 
 
-def run_demo(out: Path, workers: int) -> Result:
+def run_demo(out: Path, resources: Resources) -> Result:
     """Simulate the shipped scene into `out`/capture and process it into `out`.
 
     Parameters
     ----------
     out : Path
-    workers : int
-        Threads.
+    resources : Resources
+        Of the run; the simulator gets as many workers.
 
     Returns
     -------
@@ -53,13 +53,13 @@ def run_demo(out: Path, workers: int) -> Result:
     with compiling_ahead():
         capture = out / "capture"
         if not (capture / "capture.json").is_file():
-            simulate(capture, workers, SCENE)
+            simulate(capture, resources.workers, SCENE)
         return reconstruct(
             capture,
             out,
             hold_out=HELD_OUT,
             options=OPTIONS,
-            resources=Resources(workers=workers),
+            resources=resources,
         )
 
 

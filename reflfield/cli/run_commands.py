@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from reflfield.cli.limits import GOES_ON, limits, n_workers, working
+from reflfield.cli.limits import GOES_ON, limits, working
 from reflfield.cli.messages import say_results
 from reflfield.cli.shared_options import (
     CapturePath,
@@ -29,13 +29,15 @@ from reflfield.cli.shared_options import (
 def demo(
     out: Out = Path("demo"),
     workers: Workers = 0,
+    max_memory: MaxMemory = "4GB",
 ) -> None:
     """Simulate a small dome of a vase, process it, and compare with held-out photographs."""
     from reflfield.demo import run_demo
 
     started = time.perf_counter()
+    resources = limits(workers, max_memory)
     with working(GOES_ON):
-        result = run_demo(out, n_workers(workers))
+        result = run_demo(out, resources)
     say_results(result, started)
 
 

@@ -12,7 +12,7 @@ from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
 from reflfield.field.file import open_field
 from reflfield.observations.image_projection import Projection, project_photographs
-from reflfield.options import Resources, read_toml, with_tables
+from reflfield.options import Resources, parse_bytes, read_toml, with_tables
 from reflfield.pipeline import results
 from reflfield.pipeline.memory import (
     BASE_BYTES,
@@ -131,6 +131,11 @@ class TestCeiling:
     def test_changes_no_byte_and_holds(self, finished, run_copy, run_tiny, ceiling):
         again = ("--from", "observations", "--until", "compression", "--max-memory", ceiling)
         assert run_tiny(run_copy, *again).status == 0
+        timings = json.loads((run_copy / "timings.json").read_text())
+        assert timings["max_memory"] == parse_bytes(ceiling)
+        computed = [stage for stage in timings["stages"] if not stage["reused"]]
+        assert {stage["name"] for stage in computed} >= {"observations", "compression"}
+        assert max(stage["peak_bytes"] for stage in computed) < parse_bytes(ceiling)
         one, other = (
             hashlib.sha256((folder / "field.rfld").read_bytes()).hexdigest()
             for folder in (run_copy, finished.folder)
@@ -175,3 +180,20 @@ class TestCeiling:
         assert "--max-memory: expected at least" in outcome.err
         assert "received 1.0 GB" in outcome.err
         assert not (tmp_path / "out").exists()
+
+
+def test_the_demo_has_a_ceiling(reflfield, monkeypatch, tmp_path):
+    """What it is comes to the run, whose estimate refuses what is too little."""
+    runs = []
+
+    def refused(*_, **options):
+        runs.append(options)
+        raise InputError("too little")
+
+    monkeypatch.setattr("reflfield.demo.simulate", lambda *_: None)
+    monkeypatch.setattr("reflfield.demo.reconstruct", refused)
+    words = ("demo", "-o", tmp_path / "demo", "--workers", "1", "--max-memory")
+    assert reflfield(*words, "1.5GB").status == 2
+    assert [one["resources"] for one in runs] == [Resources(1, parse_bytes("1.5GB"))]
+    assert "max" in reflfield(*words, "much").err
+    assert len(runs) == 1
