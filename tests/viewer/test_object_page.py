@@ -192,7 +192,7 @@ class TestText:
         assert object_page(field) == page
 
     def test_too_large_a_page_is_refused(self, field):
-        with pytest.raises(InputError, match=r"page: expected at most 1,000 bytes.*--size"):
+        with pytest.raises(InputError, match=r"page: expected at most 1,000 bytes.*`size`"):
             object_page(field, most_bytes=1000)
         assert "&lt;/script&gt;" in too_large_page(HOSTILE)
 
