@@ -33,6 +33,7 @@ from reflfield.pipeline.texel_columns import (
 )
 from reflfield.render.renderer import Renderer, RenderOptions
 from reflfield.util.blocks import Blocks, Scheduler, Tally
+from tests.pipeline.conftest import HELD_OUT
 
 GB = 1 << 30
 
@@ -128,9 +129,14 @@ def test_photographs_read_at_a_time_fit_beside_what_a_fit_holds(ceiling):
 
 class TestCeiling:
     @pytest.mark.parametrize("ceiling", ["1GB", pytest.param("8GB", marks=pytest.mark.slow)])
-    def test_changes_no_byte_and_holds(self, finished, run_copy, run_tiny, ceiling):
+    def test_changes_no_byte_and_holds(
+        self, finished, run_copy, subprocess_run, tiny_capture, tiny_options, ceiling
+    ):
+        """In a process of its own: this one holds what other tests have left."""
         again = ("--from", "observations", "--until", "compression", "--max-memory", ceiling)
-        assert run_tiny(run_copy, *again).status == 0
+        words = ("run", tiny_capture, "-o", run_copy, "--config", tiny_options, *HELD_OUT)
+        done = subprocess_run("-m", "reflfield", *words, *again)
+        assert done.status == 0, done.err
         timings = json.loads((run_copy / "timings.json").read_text())
         assert timings["max_memory"] == parse_bytes(ceiling)
         computed = [stage for stage in timings["stages"] if not stage["reused"]]
