@@ -48,36 +48,37 @@ class TestExact:
         pixels, _ = make_camera().project([[0.5, 0.25, 1.0]])
         assert pixels.tolist() == [[66.0, 43.0]]
 
-    def test_centre_of_top_left_pixel_is_half_half(self):
+    def test_centre_of_top_left_pixel_is_half_half(self, rounding):
         camera = make_camera(width=2, height=2, fl_x=1.0, fl_y=1.0, cx=1.0, cy=1.0)
         _, directions = camera.rays([[0.5, 0.5]])
         expected = np.array([-0.5, -0.5, 1.0]) / np.sqrt(1.5)
-        np.testing.assert_allclose(directions[0], expected, rtol=1e-15)
+        np.testing.assert_allclose(directions[0], expected, rtol=rounding(np.float64))
 
-    def test_orthographic_scale_is_pixels_per_metre(self):
+    def test_orthographic_scale_is_pixels_per_metre(self, rounding):
         camera = make_camera("orthographic", fl_x=100.0, fl_y=100.0)
         pixels, depth = camera.project([[0.1, -0.05, -4.0]])
-        np.testing.assert_allclose(pixels, [[41.0, 20.0]], rtol=1e-15)
+        np.testing.assert_allclose(pixels, [[41.0, 20.0]], rtol=rounding(np.float64))
         assert depth.tolist() == [-4.0]
         assert camera.view_directions([[5.0, 5.0, 5.0]]).tolist() == [[0.0, 0.0, -1.0]]
 
-    def test_barrel_by_hand(self):
+    def test_barrel_by_hand(self, rounding):
         # r^2 = 1/4, g = 1 - .2/4 = .95
         camera = make_camera(distortion=(-0.2, 0, 0, 0, 0, 0))
         pixels, _ = camera.project([[0.5, 0.0, 1.0]])
-        assert pixels[0, 0] == pytest.approx(31 + 70 * 0.5 * 0.95, rel=1e-15)
+        tolerance = rounding(np.float64, scale=64)
+        assert pixels[0, 0] == pytest.approx(31 + 70 * 0.5 * 0.95, abs=tolerance)
 
     def test_view_direction_points_to_the_camera(self):
         camera = make_camera(pose=looking_at([0, 0, 3], [0, 0, 0], [0, 1, 0]))
-        np.testing.assert_allclose(camera.centre, [0, 0, 3], atol=1e-15)
-        np.testing.assert_allclose(camera.view_directions([[0, 0, 1]]), [[0, 0, 1]], atol=1e-15)
-        np.testing.assert_allclose(camera.up, [0, 1, 0], atol=1e-15)
-        np.testing.assert_allclose(camera.forward, [0, 0, -1], atol=1e-15)
+        assert camera.centre.tolist() == [0, 0, 3]
+        assert camera.view_directions([[0, 0, 1]]).tolist() == [[0, 0, 1]]
+        assert camera.up.tolist() == [0, 1, 0]
+        assert camera.forward.tolist() == [0, 0, -1]
 
     def test_looking_straight_along_up_has_an_answer(self):
         pose = looking_at([0, 0, 3], [0, 0, 0], [0, 0, 1])
-        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-15)
-        np.testing.assert_allclose(pose[2, :3], [0, 0, -1], atol=1e-15)
+        np.testing.assert_array_equal(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
+        assert pose[2, :3].tolist() == [0, 0, -1]
 
     def test_contains_what_has_a_pixel(self):
         corners = [[0, 0], [63.9, 47.9], [64, 0], [0, 48], [-0.1, 0], [np.nan, 1]]
@@ -86,35 +87,39 @@ class TestExact:
 
 
 class TestFisheye:
-    def test_equidistant_by_hand(self):
+    def test_equidistant_by_hand(self, rounding):
         # 45 degrees off the axis in x: f pi/4 from the middle
         pixels, depth = make_camera("opencv_fisheye").project([[1.0, 0.0, 1.0]])
-        np.testing.assert_allclose(pixels, [[31 + 70 * np.pi / 4, 25]], rtol=1e-15)
+        np.testing.assert_allclose(pixels, [[31 + 70 * np.pi / 4, 25]], rounding(np.float64))
         assert depth.tolist() == [1]
 
-    def test_rays_by_hand(self):
+    def test_rays_by_hand(self, rounding):
         # 70 pi/3 pixels beside the middle: 60 degrees off the axis
         _, directions = make_camera("opencv_fisheye").rays([[31 + 70 * np.pi / 3, 25]])
-        np.testing.assert_allclose(directions, [[3**0.5 / 2, 0, 0.5]], atol=1e-14)
+        tolerance = rounding(np.float64)
+        np.testing.assert_allclose(directions, [[3**0.5 / 2, 0, 0.5]], 0, tolerance)
 
-    def test_steep_rays_and_those_beyond_90_degrees(self):
+    def test_steep_rays_and_those_beyond_90_degrees(self, rounding):
         camera = make_camera("opencv_fisheye")
         radii = 70 * np.radians([0.0, 89.9, 90.1, 170.0])
         pixels = np.stack([31 + radii, np.full(4, 25.0)], axis=1)
         _, directions = camera.rays(pixels)
         angles = np.degrees(np.arccos(directions[:2, 2]))
-        np.testing.assert_allclose(angles, [0, 89.9], atol=1e-5)
+        half_of_the_digits = np.degrees(np.sqrt(rounding(np.float64)))  # arccos at 1
+        np.testing.assert_allclose(angles, [0, 89.9], rtol=0, atol=half_of_the_digits)
         assert np.isnan(directions[2:]).all()
         assert np.isnan(camera.project([[1.0, 0, 0], [1, 0, -1]])[0]).all()
 
-    def test_behind_the_fold_there_is_no_image(self):
+    def test_behind_the_fold_there_is_no_image(self, rounding):
         # theta - theta^3/3 folds at theta = 1
         camera = make_camera("opencv_fisheye", (-1 / 3, 0, 0, 0, 0, 0))
         pixels, _ = camera.project([[np.tan(0.99), 0, 1], [np.tan(1.01), 0, 1]])
-        assert pixels[0, 0] == pytest.approx(31 + 70 * (0.99 - 0.99**3 / 3), rel=1e-14)
+        tolerance = rounding(np.float64, scale=78)
+        assert pixels[0, 0] == pytest.approx(31 + 70 * (0.99 - 0.99**3 / 3), abs=tolerance)
         assert np.isnan(pixels[1]).all()
         _, directions = camera.rays([pixels[0], [31 + 70 * 0.67, 25]])
-        assert directions[0, 2] == pytest.approx(np.cos(0.99), abs=1e-7)
+        tolerance = rounding(np.float64, condition=1 / (1 - 0.99**2))  # of theta
+        assert directions[0, 2] == pytest.approx(np.cos(0.99), abs=tolerance)
         assert np.isnan(directions[1]).all()
 
     def test_lines_bend(self):

@@ -29,7 +29,7 @@ class TestSrgb:
     def test_known_values(self):
         # IEC 61966-2-1: encoded .5 is linear .21404, the linear foot ends at .04045
         assert decode_srgb(0.5) == pytest.approx(0.2140411, rel=1e-6)
-        assert decode_srgb(0.04) == pytest.approx(0.04 / 12.92, rel=1e-15)
+        assert decode_srgb(0.04) == 0.04 / 12.92
 
     def test_round_trip_of_all_bytes(self):
         codes = np.arange(256)
@@ -139,12 +139,12 @@ class TestEncodedFiles:
         np.testing.assert_allclose(read_image(path), expected, rtol=1e-6)  # float32
         assert image_size(path) == (5, 4)
 
-    def test_sixteen_bit_grey(self, tmp_path):
+    def test_sixteen_bit_grey(self, tmp_path, rounding):
         encoded = np.array([[0, 1000, 65535]], np.uint16)
         write_png(tmp_path / "g.png", encoded)
         image = read_image(tmp_path / "g.png")
         expected = decode_srgb(encoded[0].astype(np.float32) / 65535)
-        np.testing.assert_allclose(image[0, :, 1], expected, rtol=1e-6)
+        np.testing.assert_allclose(image[0, :, 1], expected, rounding(np.float32))
 
     def test_jpeg_is_close(self, tmp_path):
         Image.new("RGB", (16, 8), (200, 100, 50)).save(tmp_path / "a.jpg", quality=98)
@@ -175,9 +175,11 @@ class TestEncodedFiles:
 
 
 class TestCoverage:
-    def test_grey_is_not_srgb_decoded(self, tmp_path):
+    def test_grey_is_not_srgb_decoded(self, tmp_path, rounding):
         write_png(tmp_path / "s.png", np.array([[0, 51, 255]], np.uint8))
-        np.testing.assert_allclose(read_coverage(tmp_path / "s.png"), [[0, 0.2, 1]], rtol=1e-6)
+        np.testing.assert_allclose(
+            read_coverage(tmp_path / "s.png"), [[0, 0.2, 1]], rounding(np.float32)
+        )
 
     def test_alpha_is_taken_where_it_says_something(self, tmp_path):
         rgba = np.full((1, 2, 4), 255, np.uint8)
@@ -209,14 +211,15 @@ class TestExposures:
         merged = merge_exposures(shots, [1.0, 2.0, 4.0])
         np.testing.assert_array_equal(merged, merge_exposures(shots[::-1], [4.0, 2.0, 1.0]))
 
-    def test_grey_and_exr_exposures(self, tmp_path):
+    def test_grey_and_exr_exposures(self, tmp_path, rounding):
         write_png(tmp_path / "g.png", np.array([[0, 51, 255]], np.uint8))
         grey, kinds, _ = read_exposure(tmp_path / "g.png")
         assert kinds[0, :, 2].tolist() == [BLACK, MEASURED, SATURATED]
-        np.testing.assert_allclose(grey[0, :, 2], [0, 0.2, 1], rtol=1e-6)
+        np.testing.assert_allclose(grey[0, :, 2], [0, 0.2, 1], rounding(np.float32))
         write_exr(tmp_path / "e.exr", np.array([[[0.0, 0.214041, 5.0]]], np.float32))
         linear, kinds, _ = read_exposure(tmp_path / "e.exr")
-        np.testing.assert_allclose(linear, [[[0, 0.5, 1]]], atol=1e-6)
+        # half of the last digit of 0.214041, by the slope of 1.08
+        np.testing.assert_allclose(linear, [[[0, 0.5, 1]]], rtol=0, atol=5.4e-7)
         assert kinds[0, 0].tolist() == [BLACK, MEASURED, SATURATED]
 
     def test_saturated_and_black_everywhere(self):

@@ -40,14 +40,14 @@ def seen(capture):
     ],
 )
 @pytest.mark.parametrize("folder", ["", "Objects", "anything"])
-def test_lists_of_directions(tmp_path, file, text, folder):
+def test_lists_of_directions(tmp_path, file, text, folder, rounding):
     write_photographs(tmp_path / folder, [*NAMES, "a.mask.png", "a_normal.png"])
     write_photographs(tmp_path / "other", ["ref.png"])
     (tmp_path / file).write_text(text)
     capture = open_capture(tmp_path)
     names, directions = seen(capture)
     assert names == NAMES
-    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-12)
+    np.testing.assert_allclose(directions, DIRECTIONS, 0, rounding(np.float64))
     assert capture.silhouettes[0].name == "a.mask.png"
     assert (capture.format, capture.base_geometry, capture.n_views) == ("lights", "plane", 1)
     # x right, y up
@@ -67,7 +67,7 @@ def test_one_list_of_many_objects(tmp_path):
     np.testing.assert_allclose(seen(open_capture(tmp_path / "owl"))[1], DIRECTIONS[::-1])
 
 
-def test_diligent(tmp_path):
+def test_diligent(tmp_path, rounding):
     """Names, intensities, and files of 16 bits that are linear."""
     for i, name in enumerate(reversed(NAMES)):
         write_png(tmp_path / name, np.full((6, 8, 3), 30000 + i, np.uint16))
@@ -78,7 +78,9 @@ def test_diligent(tmp_path):
     capture = open_capture(tmp_path)
     assert seen(capture)[0] == NAMES[::-1]
     np.testing.assert_array_equal(capture.lights[2].intensity, [7, 8, 9])
-    assert capture.read_photograph(1)[0, 0, 0] == pytest.approx(30001 / 65535, rel=1e-6)
+    assert capture.read_photograph(1)[0, 0, 0] == pytest.approx(
+        30001 / 65535, rel=rounding(np.float32)
+    )
     assert any("files taken as linear" in detail for detail in capture.details)
     (tmp_path / "filenames.txt").write_text("a.0.png\n")
     with pytest.raises(CaptureError, match=r"filenames\.txt: expected 4 names"):
@@ -144,7 +146,8 @@ def test_uw_gray_sphere(shared_data):
 def test_psbox(shared_data):
     capture = open_capture(shared_data("psbox_probe"))
     assert (capture.n_lights, capture.photographs[0].path.parent.name) == (12, "Objects")
-    np.testing.assert_allclose(capture.lights[0].direction[0], -0.34766159, atol=1e-8)
+    # half of the last digit that is given here
+    assert capture.lights[0].direction[0] == pytest.approx(-0.34766159, abs=5e-9)
 
 
 # --- RTI ----------------------------------------------------------------------------------
@@ -160,12 +163,12 @@ def dome(**more):
 
 
 @pytest.mark.parametrize("kind", ["directional", "spherical", "lights3d"])
-def test_relight_dome(tmp_path, kind):
+def test_relight_dome(tmp_path, kind, rounding):
     write_photographs(tmp_path / "jpg", NAMES)
     (tmp_path / "a.dome").write_text(json.dumps(dome(lightConfiguration=kind)))
     capture = open_capture(tmp_path)
     if kind == "directional":
-        np.testing.assert_allclose(seen(capture)[1], DIRECTIONS, atol=1e-12)
+        np.testing.assert_allclose(seen(capture)[1], DIRECTIONS, 0, rounding(np.float64))
         assert capture.cameras[0].fl_x == 16
     else:  # a lamp 250 mm away, an image 80 mm wide: 16 pixels
         np.testing.assert_allclose(capture.lights[0].position, [0.15, 0, 0.2])
@@ -191,13 +194,13 @@ def test_domes_that_are_refused(tmp_path, more, reason):
         open_capture(tmp_path)
 
 
-def test_lp_whose_photographs_lie_in_a_folder(tmp_path):
+def test_lp_whose_photographs_lie_in_a_folder(tmp_path, rounding):
     write_photographs(tmp_path / "jpeg-exports", NAMES)
     lines = [f"{n} {numbers(d)}" for n, d in zip(NAMES, DIRECTIONS, strict=True)]
     (tmp_path / "a.lp").write_text("4\n" + "\n".join(lines))
     names, directions = seen(open_capture(tmp_path))
     assert names == NAMES
-    np.testing.assert_allclose(directions, DIRECTIONS, atol=1e-12)
+    np.testing.assert_allclose(directions, DIRECTIONS, 0, rounding(np.float64))
     write_photographs(tmp_path / "thumbnails", NAMES)
     with pytest.raises(CaptureError, match="expected it in one folder"):
         open_capture(tmp_path)
@@ -280,7 +283,7 @@ def test_damaged_matlab_files(near, tmp_path):
 # --- many views ---------------------------------------------------------------------------
 
 
-def test_diligent_mv(tmp_path):
+def test_diligent_mv(tmp_path, rounding):
     cameras = ring(3, cx=8.0, cy=6.0)
     stretch = np.diag([1.003458, 1, 1])  # as the published rotations are off
     calibration = {"KK": cameras[0].matrix @ np.linalg.solve(stretch, np.eye(3))
@@ -301,7 +304,8 @@ def test_diligent_mv(tmp_path):
     for photograph in capture.photographs:
         camera, light = capture.cameras[photograph.camera], capture.lights[photograph.light]
         in_camera = camera.rotation @ light.direction * [1, -1, -1]
-        assert np.abs(DIRECTIONS - in_camera).sum(axis=1).min() < 1e-9
+        difference = np.abs(DIRECTIONS - in_camera).max(axis=1).min()
+        assert difference < rounding(np.float64, condition=np.linalg.cond(inner))
     del calibration["Rc_2"]
     scipy.io.savemat(tmp_path / "Calib_Results.mat", calibration)
     with pytest.raises(CaptureError, match="none of Rc_2"):

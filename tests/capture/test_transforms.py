@@ -39,13 +39,13 @@ class TestTransforms:
     def open(self, folder, frames, **common):
         return open_capture(write_frames(folder, frames, **common), require_photographs=False)
 
-    def test_axes(self, tmp_path):
+    def test_axes(self, tmp_path, rounding):
         # OpenGL camera at z = 2 looking along -z, y up: world +y is up in the image.
         camera = self.open(tmp_path / "c", [frame()]).cameras[0]
-        np.testing.assert_allclose(camera.centre, [0, 0, 2], atol=1e-15)
-        np.testing.assert_allclose(camera.up, [0, 1, 0], atol=1e-15)
+        assert camera.centre.tolist() == [0, 0, 2]
+        assert camera.up.tolist() == [0, 1, 0]
         pixels, depth = camera.project([[0.2, 0.4, 0.0]])
-        np.testing.assert_allclose(pixels, [[4 + 1, 3 - 2]], atol=1e-14)
+        np.testing.assert_allclose(pixels, [[4 + 1, 3 - 2]], rounding(np.float64))
         assert depth.tolist() == [2]
 
     def test_same_cameras_and_lights_become_one(self, tmp_path):
@@ -201,7 +201,8 @@ class TestTransforms:
             # positions are pixel averages in half precision: a tenth of a pixel, except
             # where a pixel straddles a step in depth
             assert np.median(error) < 0.15
-            assert np.abs(np.median(pixels[:, 0] - column)) == pytest.approx(0.5, abs=0.02)
+            middle = np.median(pixels[:, 0] - column)
+            assert middle == pytest.approx(0.5, abs=0.005)  # observed 1.3e-3: they cancel
 
     def test_mitsuba_frames_to_relight(self, shared_data):
         capture = open_capture(shared_data("mitsuba_spot") / "truth" / "relit.json")
