@@ -60,15 +60,15 @@ def chart_photograph():
     return draw
 
 
-def test_matrix_of_the_camera_is_inverted(chart_photograph):
+def test_matrix_of_the_camera_is_inverted(chart_photograph, rounding):
     correction = color_correction(chart_photograph(CAMERA_FROM_LINEAR), "chart")
     assert correction.kind == "matrix"
     assert correction.grey_scatter < 1.1
     assert len(correction.lines()) == 2
-    # The patches lie off Rec.709 in one channel of one patch, which is drawn as 0: that, the
-    # samples at edges and single precision are all that is left.
+    # Means of evenly coloured patches: single precision is all that is left.
+    tolerance = rounding(np.float32, 4, np.linalg.cond(CAMERA_FROM_LINEAR))
     total = correction.matrix @ CAMERA_FROM_LINEAR
-    np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=0.03)
+    np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=tolerance)
     assert correction.error_after < 1 < correction.error_balanced < correction.error_before
 
 
@@ -100,11 +100,12 @@ def test_two_charts_are_refused(chart_photograph):
         patches(two)
 
 
-def test_clipped_patches_are_left_out(chart_photograph):
+def test_clipped_patches_are_left_out(chart_photograph, rounding):
     bright = color_correction(chart_photograph(CAMERA_FROM_LINEAR, 1.8), "chart")
     assert 12 <= bright.n_used < 24
+    tolerance = rounding(np.float32, 4, np.linalg.cond(CAMERA_FROM_LINEAR))
     total = bright.matrix @ CAMERA_FROM_LINEAR
-    np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=0.05)
+    np.testing.assert_allclose(total / total[1, 1], np.eye(3), atol=tolerance)
 
 
 def test_photograph_without_chart_is_refused(chart_photograph):
@@ -140,10 +141,10 @@ def test_saturated_pixels_stay_saturated(dome, tmp_path):
     saturated[10:20, 10:20] = True
     np.testing.assert_array_equal(kinds == 1, saturated)
     expected = (image * np.array([0.5, 1.0, 2.0], np.float32))[~saturated]
-    np.testing.assert_allclose(values[~saturated], expected, rtol=1e-6)
+    np.testing.assert_array_equal(values[~saturated], expected)
 
 
-def test_command(dome, chart_photograph, tmp_path):
+def test_command(dome, chart_photograph, tmp_path, rounding):
     one = dome.subset(views=[0, 1])
     convert_capture(one, tmp_path / "capture", link=True)
     write_exr(tmp_path / "chart.exr", chart_photograph(np.diag([0.8, 0.5, 0.3])))
@@ -152,12 +153,11 @@ def test_command(dome, chart_photograph, tmp_path):
     assert done.exit_code == 0, done.output
     entry = json.loads((tmp_path / "out/calibration.json").read_text())
     gains = np.array(entry["color"]["white_balance"])
-    np.testing.assert_allclose(gains, [0.5 / 0.8, 1.0, 0.5 / 0.3], rtol=0.01)
+    np.testing.assert_allclose(gains, [0.5 / 0.8, 1.0, 0.5 / 0.3], rounding(np.float32, 4))
     written = open_capture(tmp_path / "out")
     matrix = np.array(entry["color"]["matrix"], np.float32)
-    np.testing.assert_allclose(
-        written.read_photograph(1), np.maximum(one.read_photograph(1) @ matrix.T, 0), atol=1e-6
-    )
+    expected = np.maximum(one.read_photograph(1) @ matrix.T, 0)
+    np.testing.assert_allclose(written.read_photograph(1), expected, 0, rounding(np.float32))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["capture", "chart.exr", "out"]
 
 
@@ -185,6 +185,7 @@ def test_chart_of_a_museum(shared_data, tmp_path):
     assert correction.n_used >= 12
     # Developed with a tone curve: nothing linear does much, but the patches are the right ones.
     assert correction.error_before < 10
+    # Observed 0.028: the greys do not agree, as the scatter says.
     np.testing.assert_allclose(correction.white_balance, 1.0, atol=0.05)
     assert correction.grey_scatter > 1.5
     assert "not linear" in correction.lines()[-1]

@@ -41,4 +41,5 @@ def test_blur_lowers_sharpness(rng):
         1.0, abs=0.05
     )  # white noise: both differences alike
     assert all(np.diff(values) < 0)
-    assert values[-1] == pytest.approx(0.25, abs=0.03)
+    # Noise after a Gaussian of 4 pixels; observed 2e-4 of 40,000 pixels.
+    assert values[-1] == pytest.approx(np.expm1(-1 / 64) / np.expm1(-4 / 64), abs=1e-3)

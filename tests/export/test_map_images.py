@@ -37,12 +37,12 @@ def test_widths_are_kept_by_the_formulas_of_both(roughness, strength):
     images = {name: image[0, 0] / 255 for name, image in principled_images(maps).items()}
     aspect = np.sqrt(1 - 0.9 * images["anisotropic"])
     alpha = images["roughness"] ** 2
-    # Steps of 255ths of both: 2 % of a width of .15, the smallest here.
-    np.testing.assert_allclose([alpha / aspect, alpha * aspect], [along, across], rtol=0.02)
+    steps = 0.02  # of 255ths of both images, of a width of 0.15, the smallest here
+    np.testing.assert_allclose([alpha / aspect, alpha * aspect], [along, across], steps)
     images = {name: image[0, 0] / 255 for name, image in openpbr_images(maps).items()}
     a, r2 = images["anisotropy"], images["roughness"] ** 2
     t = r2 * np.sqrt(2 / (1 + (1 - a) ** 2))
-    np.testing.assert_allclose([t, (1 - a) * t], [along, across], rtol=0.02)
+    np.testing.assert_allclose([t, (1 - a) * t], [along, across], steps)
 
 
 def test_directions_are_turns_from_the_tangent():

@@ -89,10 +89,10 @@ def test_normals_of_the_field_stand_in_the_tangent_space_of_the_mesh():
     np.testing.assert_allclose(normal, [s, 0.0, c], atol=0.03)
 
 
-def test_a_field_that_reflects_more_than_arrives_is_shown_darker():
+def test_a_field_that_reflects_more_than_arrives_is_shown_darker(rounding):
     field = baked_field(square_surface(2), lambert(5.0), domain="linear")
     maps = material_maps(field, export_atlas(field))
-    assert maps.exposure == pytest.approx(0.9 / 5.0, rel=0.02)
+    assert maps.exposure == pytest.approx(0.9 / 5.0, rel=rounding(np.float32))
     assert maps.errors["relative"] < 0.03
     assert any("darker" in line for line in maps.lines())
 

@@ -84,7 +84,8 @@ def test_light_from_the_right_lights_what_faces_right(glossy, tmp_path):
     away = shown(tmp_path / "out", [-0.7, 0.0, 0.71]).mean(axis=2)
     assert image[:, ::2].mean() > 1.2 * away[:, ::2].mean()
     normals = layers(tmp_path / "out" / "normals.exr")
-    np.testing.assert_allclose(normals["normal.X"][:, ::2], np.sin(0.4), atol=0.01)
+    # The fit moves the normals a little: observed 3e-5.
+    np.testing.assert_allclose(normals["normal.X"][:, ::2], np.sin(0.4), atol=1e-4)
 
 
 def test_components_are_exact_to_their_rounding(rng):
