@@ -162,7 +162,7 @@ def compare(ours, theirs):
     ],
     ids=["diffuse amphora", "brushed vase"],
 )
-def test_direct_light_and_shadows(mi, thing, material, bsdf, tmp_path):
+def test_direct_light_and_shadows(mi, thing, material, bsdf, tmp_path, rounding):
     scene = scene_of(thing, material, camera=[1, -2, 1.5], light=[2, -1, 1.0], side=128)
     # Facets as they are: both sides trace shadow rays from the same flat triangles.
     scene = replace(scene, mesh=with_tangents_per_face(scene.mesh, flat=True))
@@ -173,12 +173,12 @@ def test_direct_light_and_shadows(mi, thing, material, bsdf, tmp_path):
     # which the height that shadow rays start at decides.
     lifted = photograph(scene, lift=MITSUBA_LIFT)
     away = (lifted > 0).any(axis=1) == (ours > 0).any(axis=1)
-    away[view.pixel[view.points.barycentric.min(axis=1) < 1e-3]] = False
+    away[view.pixel[view.points.barycentric.min(axis=1) < 1e-3]] = False  # of a facet's width
     assert away.mean() > 0.99
     disagree, error = compare(ours[away], theirs[away])
     assert (theirs > 0).any(axis=1).sum() > 1500
-    assert disagree.mean() <= 1e-4
-    assert error <= 1e-4
+    assert not disagree.any()
+    assert error <= rounding(np.float32, operations=4)
 
 
 def test_smooth_normals_differ_only_at_the_terminator(mi, tmp_path):
@@ -199,8 +199,8 @@ def test_smooth_normals_differ_only_at_the_terminator(mi, tmp_path):
     elsewhere = np.ones(len(ours), dtype=bool)
     elsewhere[view.pixel[at_terminator]] = False
     disagree, error = compare(ours[elsewhere], theirs[elsewhere])
-    assert disagree.mean() <= 1e-4
-    assert error <= 1e-4
+    assert not disagree.any()
+    assert error <= 2e-5  # observed 5e-6: single precision of the interpolated normals there
     assert np.abs(ours - theirs)[~elsewhere].max() < 0.03 * theirs.max()
 
 
@@ -218,14 +218,14 @@ def brushed_plate(side):
     )
 
 
-def test_anisotropic_highlight_stretches_along_the_rougher_axis(mi, tmp_path):
+def test_anisotropic_highlight_stretches_along_the_rougher_axis(mi, tmp_path, rounding):
     scene = brushed_plate(64)
     ours = photograph(scene)
     bsdf = {**MITSUBA_METAL, "alpha_u": 0.4, "alpha_v": 0.1}
     theirs = reference(mi, scene, bsdf, tmp_path, DIRECT)[:, 0]
     disagree, error = compare(ours, theirs)
     assert not disagree.any()
-    assert error <= 1e-4
+    assert error <= rounding(np.float32, operations=4)
     # The tangent dP/du of the plate is +X, to the right in the image: rough there.
     image = ours.reshape(64, 64, 3)[..., 0]
     ticks = np.arange(64) - 31.5

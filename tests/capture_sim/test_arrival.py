@@ -55,7 +55,7 @@ def test_light_arrives_as_by_the_formulas(scene, near, precision, rng, rounding)
     )
     light = np.arange(len(points)) % 3
     targets = expected.targets[np.arange(len(points)), light]
-    np.testing.assert_allclose(arrays.targets(light, points), targets, rtol=1e-12)
+    np.testing.assert_allclose(arrays.targets(light, points), targets, rounding(np.float64))
 
 
 def test_unknown_lights_are_refused(scene):

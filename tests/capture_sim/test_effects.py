@@ -104,7 +104,7 @@ def test_antialiasing_is_off_with_single_rays():
     assert antialiasing.cost(scene(), WORK).rays == 100 * 16 + 40
 
 
-def test_spot_beam_falls_off_with_the_cosine_power():
+def test_spot_beam_falls_off_with_the_cosine_power(rounding):
     spot = {
         "id": "l0",
         "type": "spot",
@@ -117,7 +117,7 @@ def test_spot_beam_falls_off_with_the_cosine_power():
     arriving = near_lights.apply((spot,), points)
     # On the axis 8; at 45 degrees 8 / 2 * (1/sqrt 2)^3; behind the lamp nothing.
     expected = [8.0, 4.0 / 2**1.5, 0.0]
-    np.testing.assert_allclose(arriving.irradiance[:, 0, 0], expected, rtol=1e-14)
+    np.testing.assert_allclose(arriving.irradiance[:, 0, 0], expected, rounding(np.float64))
 
 
 def test_far_point_light_tends_to_a_directional_one():
@@ -133,7 +133,8 @@ def test_far_point_light_tends_to_a_directional_one():
     both = near_lights.apply((far, sun), points)
     # The parallax of 0.2 m at 100 km.
     np.testing.assert_allclose(both.directions[:, 0], both.directions[:, 1], atol=5e-6)
-    np.testing.assert_allclose(both.irradiance[:, 0], both.irradiance[:, 1], rtol=1e-5)
+    # 0.1 m nearer of 100 km, squared.
+    np.testing.assert_allclose(both.irradiance[:, 0], both.irradiance[:, 1], rtol=2.1e-6)
 
 
 @pytest.mark.parametrize(

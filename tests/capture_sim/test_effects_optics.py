@@ -29,13 +29,13 @@ def scene(thing=None, kind="point", cameras=None, **effects):
     )
 
 
-def test_natural_vignetting_is_the_fourth_power_of_the_cosine():
+def test_natural_vignetting_is_the_fourth_power_of_the_cosine(rounding):
     camera = scene(cameras={"field_of_view_deg": 70.0}).cameras[0]
     column, row = np.meshgrid(np.arange(48) + 0.5, np.arange(48) + 0.5)
     _, rays = camera_rays(camera, np.stack([column.ravel(), row.ravel()], axis=1))
     axis = np.array(camera["camera_from_world"])[2, :3]
     gain = vignetting.gain(camera, vignetting.Options(coefficients=(0.0,)))
-    np.testing.assert_allclose(gain.ravel(), (rays @ axis) ** 4, rtol=1e-12)
+    np.testing.assert_allclose(gain.ravel(), (rays @ axis) ** 4, rounding(np.float64, 4))
 
 
 def test_vignetting_of_an_orthographic_camera_is_the_polynomial():
@@ -62,11 +62,11 @@ def test_disc_diameter_by_tracing_two_rays_through_the_lens():
 
 
 @pytest.mark.parametrize("diameter", [0.5, 1.0, 3.0, 7.5])
-def test_disc_kernels_have_the_moments_of_a_disc(diameter):
+def test_disc_kernels_have_the_moments_of_a_disc(diameter, rounding):
     kernel = defocus.disc_kernel(diameter).astype(float)
     half = len(kernel) // 2
     ticks = np.arange(-half, half + 1)
-    assert kernel.sum() == pytest.approx(1.0, abs=1e-6)
+    assert kernel.sum() == pytest.approx(1.0, abs=rounding(np.float32))
     assert abs(kernel.sum(axis=0) @ ticks) < 2e-3  # centred, as far as 2048 points are
     if diameter >= 1.0:
         # Variance r^2 / 4 of the disc, plus at most 1/4 of linear interpolation.
@@ -109,8 +109,12 @@ def test_a_lamp_shines_as_much_as_its_patches(kind):
     # Patches to the side are farther away by the square of their angle, 1e-4, or less.
     np.testing.assert_allclose(total, whole.irradiance[:, 0], rtol=3e-4)
     cosine = parts.directions[0] @ whole.directions[0, 0]
-    size = np.radians(1.0) if kind == "directional" else 0.01 / 0.95
-    assert np.degrees(np.arccos(cosine.min())) == pytest.approx(np.degrees(size), rel=0.06)
+    size = np.radians(1.0)
+    if kind == "point":
+        size = 0.01 / np.linalg.norm(lamp["position"] - point[0])
+    outermost = np.sqrt(24.5 / 25) * size  # of 25
+    # The disc faces the object's centre, off the point: observed 1e-3.
+    assert np.arccos(cosine.min()) == pytest.approx(outermost, rel=2e-3)
 
 
 def test_light_of_half_a_lamp_on_the_horizon():
@@ -119,7 +123,8 @@ def test_light_of_half_a_lamp_on_the_horizon():
     lamp = {**thing.lights[0], "direction": [1.0, 0.0, 0.0], "irradiance": [1.0, 1.0, 1.0]}
     patches = illuminate(light_extent.apply(thing, lamp), np.zeros((1, 3)))
     arrives = (np.maximum(patches.directions[0, :, 2], 0) * patches.irradiance[0, :, 0]).sum()
-    assert arrives == pytest.approx(2 * np.radians(2.0) / (3 * np.pi), rel=0.02)
+    # Patches: observed 1.7e-3 of 1,024.
+    assert arrives == pytest.approx(2 * np.radians(2.0) / (3 * np.pi), rel=5e-3)
 
 
 def test_uniform_room_is_a_white_furnace():
@@ -135,10 +140,11 @@ def test_uniform_room_is_a_white_furnace():
     np.testing.assert_allclose(inside, 0.6 * 0.5, rtol=5e-3)
 
 
-def test_room_light_is_brighter_on_one_side():
+def test_room_light_is_brighter_on_one_side(rounding):
     lights = environment.apply(
         scene(environment={"direction": [0, 0, 2], "directionality": 1.0})
     )
     up = np.array([light["direction"][2] for light in lights])
     shine = np.array([light["irradiance"][0] for light in lights])
-    np.testing.assert_allclose(shine / shine.mean(), 1.0 + up, atol=1e-9)
+    tolerance = rounding(np.float64, scale=2)
+    np.testing.assert_allclose(shine / shine.mean(), 1.0 + up, rtol=0, atol=tolerance)

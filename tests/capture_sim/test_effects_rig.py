@@ -51,7 +51,7 @@ def test_reported_calibration_stays_where_errors_are_not_calibrated():
     assert {light["type"] for light in rig.lights} == {"spot"}
 
 
-def test_poses_err_by_the_given_standard_deviations():
+def test_poses_err_by_the_given_standard_deviations(rounding):
     thing = scene(n=400, pose_error={"rotation_deg": 0.5, "translation": 1e-3})
     rig = real_rig(thing)
     before = np.array([c["camera_from_world"] for c in thing.cameras])
@@ -61,7 +61,8 @@ def test_poses_err_by_the_given_standard_deviations():
     band = 4.0 / np.sqrt(2 * turns.size)  # 4 sigma of a standard deviation
     assert turns.std() == pytest.approx(0.5, rel=band)
     assert error[:, :3, 3].std() == pytest.approx(1e-3, rel=band)
-    np.testing.assert_allclose(np.linalg.det(after[:, :3, :3]), 1.0, atol=1e-12)
+    determinants = np.linalg.det(after[:, :3, :3])
+    np.testing.assert_allclose(determinants, 1.0, rounding(np.float64, operations=6))
 
 
 def test_misregistration_moves_the_principal_point():
@@ -133,7 +134,7 @@ def test_lights_move_by_the_given_standard_deviations(kind):
     assert light_position_error.needed(thing).bound > 0.0
 
 
-def test_fall_off_is_a_power_of_the_cosine_about_the_object():
+def test_fall_off_is_a_power_of_the_cosine_about_the_object(rounding):
     thing = scene(n=3, falloff_profile={"exponent": 2.0, "calibrated": True})
     rig = real_rig(thing)
     assert rig.reported_lights == rig.lights
@@ -143,9 +144,11 @@ def test_fall_off_is_a_power_of_the_cosine_about_the_object():
     to_centre, to_point = -position, point[0] - position
     cosine = to_centre @ to_point / np.linalg.norm(to_centre) / np.linalg.norm(to_point)
     np.testing.assert_allclose(
-        spot.irradiance[0, 0], plain.irradiance[0, 0] * cosine**2, rtol=1e-12
+        spot.irradiance[0, 0], plain.irradiance[0, 0] * cosine**2, rounding(np.float64)
     )
-    assert falloff_profile.needed(thing).bound == pytest.approx(0.05**2, rel=1e-9)
+    assert falloff_profile.needed(thing).bound == pytest.approx(
+        0.05**2, abs=rounding(np.float64)
+    )
 
 
 def test_photographs_are_dropped_with_the_given_probability():

@@ -216,7 +216,7 @@ def test_conductor_matches_mitsuba(alphas, rng, rounding):
     ours = material.evaluate(views, lights, np.zeros((200, 2))) * lights[:, 2:]
     # Their single precision; half vectors of narrow lobes are conditioned by 1 / alpha^2.
     tolerance = rounding(np.float32, operations=4, condition=1 / min(alphas))
-    np.testing.assert_allclose(ours, theirs, rtol=tolerance, atol=1e-6)
+    np.testing.assert_allclose(ours, theirs, rtol=tolerance)
 
 
 @pytest.mark.reference

@@ -184,15 +184,15 @@ def test_warp_inversion_is_the_distribution_function(rng):
     np.testing.assert_allclose(ours, [x, y], atol=1e-4)  # midpoint rule, 400 steps
 
 
-def test_warp_is_monotone_and_onto(rng):
+def test_warp_is_monotone_and_onto(rng, rounding):
     warp = Warp.of(0.01 + rng.random((1, 6, 6)) ** 4)
     t = np.linspace(0.0, 1.0, 101)
     at = Slices.between([np.zeros(1)], [np.zeros(101)])
     across = warp.invert(np.stack([t, np.full(101, 0.4)], axis=1), at)[:, 0]
     up = warp.invert(np.stack([np.full(101, 0.4), t], axis=1), at)[:, 1]
     for samples in (across, up):
-        assert samples[0] == pytest.approx(0.0, abs=1e-15)
-        assert samples[-1] == pytest.approx(1.0, abs=1e-12)
+        assert samples[0] == pytest.approx(0.0, abs=rounding(np.float64))
+        assert samples[-1] == pytest.approx(1.0, abs=rounding(np.float64))
         assert (np.diff(samples) > 0.0).all()
 
 
@@ -215,7 +215,7 @@ FILES = ["cc_ibiza_sunset", "cc_iris_purple_gem", "colodur_napoli_4f", "paper_wh
 
 @pytest.mark.reference
 @pytest.mark.parametrize("name", FILES)
-def test_measured_files_match_mitsuba(name, rng, shared_data):
+def test_measured_files_match_mitsuba(name, rng, shared_data, rounding):
     path = shared_data("rgl_bsdf") / f"{name}_rgb.bsdf"
     views, lights = upper_directions(rng, 300), upper_directions(rng, 300)
     material = make_material({"type": "rgl", "file": str(path)})
@@ -223,21 +223,21 @@ def test_measured_files_match_mitsuba(name, rng, shared_data):
     theirs = np.maximum(mitsuba_values(path, views, lights), 0.0)  # ours has no negative values
     # Their single precision through the inversion of two cumulative sums over 128 nodes.
     np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=1e-5)
-    assert np.median(np.abs(ours - theirs) / (theirs + 1e-3)) < 5e-6
+    assert np.median(np.abs(ours - theirs) / (theirs + 1e-3)) < rounding(np.float32)
 
 
 @pytest.mark.reference
 @pytest.mark.parametrize(
     ("n_phi", "azimuths"), [(9, 2 * np.pi), (5, np.pi), (4, np.pi / 2), (1, 0.0)]
 )
-def test_every_layout_matches_mitsuba(n_phi, azimuths, rng, saved):
+def test_every_layout_matches_mitsuba(n_phi, azimuths, rng, saved, rounding):
     path = saved(tensor_file(small_material(rng, n_phi, azimuths)))
     views, lights = upper_directions(rng, 200), upper_directions(rng, 200)
     material = read_rgl(path)
     ours = material.evaluate(views, lights, np.zeros((200, 2))) * lights[:, 2:]
-    # Well conditioned tables: single precision of some hundred operations.
+    # Well conditioned tables: single precision of a hundred independent roundings.
     theirs = mitsuba_values(path, views, lights)
-    np.testing.assert_allclose(ours, theirs, rtol=1e-4)
+    np.testing.assert_allclose(ours, theirs, rounding(np.float32, operations=10))
     assert material.isotropic == (n_phi <= 2)
 
 

@@ -20,6 +20,7 @@ from capture_sim.surface import surface_points
 from capture_sim.view_samples import sample_view
 
 DIRECT = ("near_lights", "shadows")
+QUADRATURE = 1.49e-8  # relative error that `quad` stops at
 
 
 def scene_of(thing, length, *, albedo=0.8, lights=None, side=24, steps=3.0):
@@ -53,9 +54,9 @@ def test_profile_integrates_to_the_albedo(albedo, refraction):
     ring = lambda r: 2.0 * np.pi * r * dipole.profile(np.array(r))  # noqa: E731
     near, far = dipole.depths[0], 40 * dipole.length
     whole = quad(ring, 0, near)[0] + quad(ring, near, far, limit=200)[0]
-    assert whole == pytest.approx(albedo, rel=1e-6)  # of the quadrature
+    assert whole == pytest.approx(albedo, rel=QUADRATURE)
     inside = quad(ring, 0, near)[0] + quad(ring, near, 0.01)[0]
-    assert inside == pytest.approx(float(dipole.within(np.array(0.01))), rel=1e-6)
+    assert inside == pytest.approx(float(dipole.within(np.array(0.01))), rel=QUADRATURE)
     assert (np.diff(dipole.profile(np.linspace(0.0, 0.05, 200))) < 0.0).all()
 
 
@@ -63,10 +64,11 @@ def test_profile_integrates_to_the_albedo(albedo, refraction):
 def test_evenly_lit_plate_is_lambertian_away_from_its_rim():
     scene = scene_of({"preset": "flat_sample", "size": [0.1, 0.1]}, 0.004, steps=4.0)
     image, lambert = photographs(scene), photographs(without(scene))
-    # 9 diffusion lengths, 36 mm, from the rim: the middle of 100 mm; 1e-3 gets farther,
-    # and the grid of a quarter of a length resolves the profile to half a per cent.
+    # 9 diffusion lengths, 36 mm, from the rim: the middle of 100 mm; 1e-3 gets farther, the
+    # rest is the grid of a quarter of a length. Observed 2.1e-3, near the rim as well.
+    part = 4e-3
     middle = image[:, 10:14, 10:14] / lambert[:, 10:14, 10:14]
-    np.testing.assert_allclose(middle, 1.0, atol=7e-3)
+    np.testing.assert_allclose(middle, 1.0, rtol=0, atol=part)
     # Near the rim, but farther than two steps of the grid within which the surface is taken
     # for flat, the light is missing that would come from beyond its straight edge.
     dipole = scene.material.dipoles[0]
@@ -75,7 +77,7 @@ def test_evenly_lit_plate_is_lambertian_away_from_its_rim():
         beyond = lambda r, e=edge: 2 * r * np.arccos(e / r) * dipole.profile(np.array(r))  # noqa: E731
         expected = 1.0 - quad(beyond, edge, 0.08, limit=200)[0] / 0.8
         ratio = image[0, 11:13, column, 0] / lambert[0, 11:13, column, 0]
-        np.testing.assert_allclose(ratio, expected, atol=7e-3)
+        np.testing.assert_allclose(ratio, expected, rtol=0, atol=part)
 
 
 def test_spot_of_light_spreads_as_the_integral_says():
@@ -159,7 +161,7 @@ def test_no_light_is_won():
     assert (outgoing <= 0.8 * 1.01 * incoming).all()
 
 
-def test_areas_of_nodes_add_up_to_the_surface():
+def test_areas_of_nodes_add_up_to_the_surface(rounding):
     mesh = scene_of({"preset": "sphere", "around": 24}, 0.01).mesh
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(
@@ -167,12 +169,13 @@ def test_areas_of_nodes_add_up_to_the_surface():
     )
     nodes = subsurface.Nodes.of(mesh, 0.004)
     total = subsurface.node_areas(mesh, nodes).sum()
-    assert total == pytest.approx(0.5 * area.sum(), rel=1e-12)
+    assert total == pytest.approx(0.5 * area.sum(), abs=rounding(np.float64))
 
 
 def test_free_when_off_and_called_for_by_the_material(monkeypatch):
     scene = scene_of({"preset": "sphere"}, 0.01)
     assert subsurface.needed(scene).bound > 0.1
+    # In proportion to the reach, of a millionth of the object.
     assert subsurface.needed(scene_of({"preset": "sphere"}, 1e-7)).bound < 1e-3
     clay = replace(scene, material=make_material({"preset": "matte_clay"}))
     assert subsurface.needed(clay).bound == 0.0
