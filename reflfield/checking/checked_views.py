@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from reflfield.checking.photograph_statistics import MEAN_PIXELS, PhotographSet,
 from reflfield.errors import CaptureError, GeometryError, InputError
 from reflfield.geometry.cones import View
 from reflfield.geometry.silhouette_distance import signed_distance
+from reflfield.options import available_cores
+from reflfield.util.progress import track
 
 Float32 = NDArray[np.float32]
 
@@ -59,18 +62,27 @@ class UnusableView:
 def checked_views(
     capture: Capture, photographs: PhotographSet
 ) -> Iterator[CheckedView | UnusableView]:
-    """Silhouettes of all views that have photographs or a silhouette file."""
-    for number in range(capture.n_views):
-        if capture.silhouettes[number] is None and number not in photographs.means:
-            continue
-        try:
-            coverage, origin = _coverage(capture, number, photographs)
-            camera = at_size(capture.cameras[number], coverage.shape)
-            outline = signed_distance(coverage, f"silhouette of view {camera.id!r}")
-        except (InputError, GeometryError) as error:
-            yield UnusableView(number, str(error))
-            continue
-        yield CheckedView(number, camera, coverage, origin, View(camera, outline))
+    """Silhouettes of all views that have photographs or a silhouette file, in all cores."""
+    numbers = [
+        number
+        for number in range(capture.n_views)
+        if capture.silhouettes[number] is not None or number in photographs.means
+    ]
+    with ThreadPoolExecutor(available_cores()) as pool:
+        views = pool.map(lambda number: _checked_view(capture, number, photographs), numbers)
+        yield from track(views, len(numbers), "silhouettes")
+
+
+def _checked_view(
+    capture: Capture, number: int, photographs: PhotographSet
+) -> CheckedView | UnusableView:
+    try:
+        coverage, origin = _coverage(capture, number, photographs)
+        camera = at_size(capture.cameras[number], coverage.shape)
+        outline = signed_distance(coverage, f"silhouette of view {camera.id!r}")
+    except (InputError, GeometryError) as error:
+        return UnusableView(number, str(error))
+    return CheckedView(number, camera, coverage, origin, View(camera, outline))
 
 
 def at_size(camera: Camera, shape: tuple[int, ...]) -> Camera:

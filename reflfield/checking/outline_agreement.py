@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 # Points of each outline, samples along the ray of each, and finer ones beside the best; fewer
 # of both where there are many views.
 RAYS, SAMPLES, FINER = 120, 48, 12
+# More others than this tell a view nothing more.
 MANY_VIEWS = 60
 # Distances are kept in quarters of a pixel, up to this many pixels.
 _FARTHEST_PX, _STEPS = 31.0, 4.0
@@ -41,27 +42,33 @@ class OutlineAgreement:
 
     Parameters
     ----------
-    outside : list of (rays, samples, n_views) int8
-        For each view: quarters of a pixel by which each view excludes each sample; 0 where it
-        does not.
+    others : list of (n,) int
+        For each view: those that it is compared with.
+    outside : list of (rays, samples, n) int8
+        For each view: quarters of a pixel by which each of those excludes each sample; 0 where
+        it does not.
     """
 
+    others: list[NDArray[np.intp]]
     outside: list[NDArray[np.int8]]
 
     def evidence(self, some: Sequence[int]) -> Evidence:
         """Evidence for and against some of the views."""
         n = len(some)
         blame, uncovered = np.zeros((n, n)), np.zeros(n)
+        place = np.full(len(self.outside), -1)
+        place[list(some)] = np.arange(n)
         for column, view in enumerate(some):
-            excluded = self.gaps(view, some) > TOLERANCE_PX
+            row = place[self.others[view]]
+            excluded = self._gaps(view, row >= 0) > TOLERANCE_PX
             weight = 1.0 / np.maximum(excluded.sum(axis=1), 1)
-            blame[:, column] = (excluded * weight[:, None]).mean(axis=0)
+            blame[row[row >= 0], column] = (excluded * weight[:, None]).mean(axis=0)
             uncovered[column] = excluded.any(axis=1).mean()
         return Evidence(blame, uncovered)
 
-    def gaps(self, view: int, some: Sequence[int]) -> Array:
-        """Pixels (rays, n) by which some views exclude the best point of each ray of a view."""
-        outside = self.outside[view][..., list(some)]
+    def _gaps(self, view: int, heard: NDArray[np.bool_]) -> Array:
+        """Pixels (rays, n) by which some others exclude the best point of a view's rays."""
+        outside = self.outside[view][..., heard]
         tolerated = np.maximum(outside.astype(np.int16) - int(TOLERANCE_PX * _STEPS), 0)
         best = tolerated.sum(axis=2).argmin(axis=1)
         return outside[np.arange(len(outside)), best] / _STEPS
@@ -89,9 +96,21 @@ def outline_agreement(views: Sequence[View], low: Array, high: Array) -> Outline
     """
     fewer = min(1.0, MANY_VIEWS / len(views))
     n_rays, n_samples = max(40, int(RAYS * fewer)), max(32, int(SAMPLES * fewer))
+    others = [_others_of(number, len(views)) for number in range(len(views))]
     return OutlineAgreement(
-        [_outside(number, views, low, high, n_rays, n_samples) for number in range(len(views))]
+        others,
+        [
+            _outside(view, [views[i] for i in some], low, high, n_rays, n_samples)
+            for view, some in zip(views, others, strict=True)
+        ],
     )
+
+
+def _others_of(number: int, n_views: int) -> NDArray[np.intp]:
+    """Other views, of many some that are spread evenly over all."""
+    n_others = min(n_views - 1, MANY_VIEWS)
+    steps = 1 + np.arange(n_others) * (n_views - 1) // max(n_others, 1)
+    return np.sort((number + steps) % n_views)
 
 
 def outline_points(view: View, most: int) -> Array:
@@ -104,33 +123,29 @@ def outline_points(view: View, most: int) -> Array:
 
 
 def _outside(
-    number: int, views: Sequence[View], low: Array, high: Array, n_rays: int, n_samples: int
+    view: View, others: Sequence[View], low: Array, high: Array, n_rays: int, n_samples: int
 ) -> NDArray[np.int8]:
-    """Exclusion of samples along the rays of one view's outline by all views."""
-    view = views[number]
+    """Exclusion of samples along the rays of one view's outline by others."""
     origins, ways = view.camera.rays(outline_points(view, n_rays))
     near, far = _box_interval(origins, ways, low, high)
     at = near[:, None] + (far - near)[:, None] * (np.arange(n_samples) + 0.5) / n_samples
-    coarse = _excluded(number, views, origins, ways, at)
+    coarse = _excluded(others, origins, ways, at)
     best = np.maximum(coarse.astype(np.int16) - int(TOLERANCE_PX * _STEPS), 0).sum(axis=2)
     centre = np.take_along_axis(at, best.argmin(axis=1)[:, None], axis=1)
     step = (far - near)[:, None] / n_samples
     finer = centre + step * np.linspace(-1, 1, FINER)
-    return np.concatenate([coarse, _excluded(number, views, origins, ways, finer)], axis=1)
+    return np.concatenate([coarse, _excluded(others, origins, ways, finer)], axis=1)
 
 
 def _excluded(
-    number: int, views: Sequence[View], origins: Array, ways: Array, at: Array
+    others: Sequence[View], origins: Array, ways: Array, at: Array
 ) -> NDArray[np.int8]:
-    """Quarters of a pixel (rays, samples, n_views) by which views exclude samples of rays."""
+    """Quarters of a pixel (rays, samples, n) by which views exclude samples of rays."""
     points = (origins[:, None] + at[..., None] * ways[:, None]).reshape(-1, 3)
-    outside = np.zeros((len(points), len(views)), np.int8)
-    for other, view in enumerate(views):
-        if other != number:
-            outside[:, other] = np.rint(
-                _STEPS * np.clip(-_pixels(view, points), 0, _FARTHEST_PX)
-            )
-    return outside.reshape(*at.shape, len(views))
+    outside = np.zeros((len(points), len(others)), np.int8)
+    for column, view in enumerate(others):
+        outside[:, column] = np.rint(_STEPS * np.clip(-_pixels(view, points), 0, _FARTHEST_PX))
+    return outside.reshape(*at.shape, len(others))
 
 
 def _pixels(view: View, points: Array) -> Array:

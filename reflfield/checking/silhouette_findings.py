@@ -26,7 +26,7 @@ from reflfield.geometry.explanations import (
 )
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.ray_scene import RayScene
-from reflfield.geometry.visual_hull import HullOptions, visual_hull
+from reflfield.geometry.visual_hull import MADE_OVERLAP, HullOptions, visual_hull
 
 Array = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -196,10 +196,10 @@ def contradiction_findings(
     verdict = agreement.verdict()
     outliers = verdict.outliers
     good = [view for i, view in enumerate(views) if i not in outliers]
-    mesh, failure = _hull(good)
+    mesh, failure, fit = _hull(good)
     findings: list[Finding] = []
     if not verdict.agree:
-        findings.append(_all_contradict(views, verdict))
+        findings.append(_all_contradict(views, verdict, fit))
     astray = set()
     for i in outliers:
         words = _contradicted(verdict, i, len(good))
@@ -233,10 +233,21 @@ def _nothing_common(views: Sequence[CheckedView]) -> Finding:
     return _together(why, "the silhouettes bound no common body")
 
 
-def _all_contradict(views: Sequence[CheckedView], verdict: Verdict) -> Finding:
+def _all_contradict(views: Sequence[CheckedView], verdict: Verdict, fit: float) -> Finding:
     covered = 1 - float(np.median(verdict.uncovered))
-    why = explain_all([v.camera for v in views], [v.coverage for v in views], covered)
     n = int((verdict.uncovered > np.median(verdict.uncovered) / 2).sum())
+    if _all_made(views) and fit > MADE_OVERLAP:
+        return Finding(
+            "masks made from photographs",
+            WARNING,
+            (),
+            f"{n} of {len(views)} are excluded in parts by others, as where the object is as "
+            "dark as the backdrop; the hull that most of them allow agrees with them to "
+            f"{100 * fit:.0f} % (median, intersection over union)",
+            "give masks, or make better ones with `reflfield masks`; if these look right, "
+            "check the calibration",
+        )
+    why = explain_all([v.camera for v in views], [v.coverage for v in views], covered)
     return _together(
         why,
         f"{n} of {len(views)} outlines are excluded in parts by other views, no few to blame",
@@ -263,14 +274,19 @@ def _together(why: Explanation | None, words: str) -> Finding:
     )
 
 
-def _hull(views: Sequence[CheckedView]) -> tuple[Mesh | None, str]:
+def _all_made(views: Sequence[CheckedView]) -> bool:
+    return all(view.origin == "photographs" for view in views)
+
+
+def _hull(views: Sequence[CheckedView]) -> tuple[Mesh | None, str, float]:
+    """Coarse hull or why there is none, and how well (median overlap) it fits the views."""
     options = HullOptions(resolution=RESOLUTION, n_triangles=N_TRIANGLES)
+    cameras, silhouettes = [view.camera for view in views], [view.coverage for view in views]
     try:
-        return visual_hull(
-            [view.camera for view in views], [view.coverage for view in views], options
-        )[0], ""
+        mesh, report = visual_hull(cameras, silhouettes, options, made=_all_made(views))
     except (GeometryError, InputError) as error:
-        return None, str(error)
+        return None, str(error), 0.0
+    return mesh, "", float(np.median(report.overlap))
 
 
 def _contradicted(verdict: Verdict, number: int, n_others: int) -> str:

@@ -37,6 +37,8 @@ _SAMPLES_AT_ONCE = 1 << 20
 _NOISE_PX = 0.5
 # More views than this share cannot all be wrong while the others are right.
 _LARGEST_MINORITY = 0.25
+# Of so many views one is set aside at a time.
+_VIEWS_PER_STEP = 60
 # Fewer views than this always agree, or cannot tell which of them is wrong.
 _SMALLEST_MAJORITY = 3
 
@@ -154,7 +156,8 @@ def set_aside(
     most = min(int(max(1, _LARGEST_MINORITY * n_views)), n_views - _SMALLEST_MAJORITY)
     while evidence.uncovered.max() > most_uncovered and len(aside) < most:
         share = evidence.blame.sum(axis=0) + evidence.blame.sum(axis=1)
-        aside.append(kept[int(share.argmax())])
+        n_next = min(max(1, n_views // _VIEWS_PER_STEP), most - len(aside))
+        aside += [kept[i] for i in np.argsort(-share, kind="stable")[:n_next]]
         kept = [i for i in everyone if i not in aside]
         evidence = evidence_of(kept)
     agree = bool(evidence.uncovered.max() <= most_uncovered)

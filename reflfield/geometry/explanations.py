@@ -40,6 +40,9 @@ _GOOD_OVERLAP = 0.7
 _BETTER = 0.15
 _EQUALLY_GOOD = 0.02
 
+# Views, evenly spread over all, in which a mistake common to all is looked for.
+_VIEWS_COMPARED = 32
+
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -240,7 +243,17 @@ def explain_all(
     Returns
     -------
     Explanation or None
+
+    Notes
+    -----
+    What all views have in common shows in some of them: of many, 32 are compared, and the
+    share that is covered as they are is theirs.
     """
+    if len(cameras) > _VIEWS_COMPARED:
+        some = np.linspace(0, len(cameras) - 1, _VIEWS_COMPARED).astype(int)
+        cameras = [cameras[view] for view in some]
+        silhouettes = [silhouettes[view] for view in some]
+        before = _agreement(cameras, silhouettes, scratch)
     tried: list[tuple[str, str, Sequence[Camera], Sequence[NDArray[np.floating]]]]
     inverted = "all are inverted (white must mean object)"
     tried = [("inverted", inverted, cameras, Inverted(silhouettes))]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.encoding import encode_srgb
-from reflfield.capture.segmentation import silhouette_from_photographs
+from reflfield.capture.segmentation import largest_channel, silhouette_from_photographs
 from reflfield.errors import CaptureError, InputError
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.visual_hull import HullOptions, visual_hull
@@ -175,7 +175,7 @@ def _outlines(
 
 def _encoded(photograph: Floats) -> Bytes:
     """Photograph as bytes, sRGB-encoded, its brightest pixels white."""
-    white = float(np.quantile(photograph.max(axis=2), 0.995))
+    white = float(np.quantile(largest_channel(photograph), 0.995))
     shown = encode_srgb(np.clip(photograph / max(white, 1e-12), 0, 1))
     return np.rint(shown * 255).astype(np.uint8)
 
@@ -207,9 +207,9 @@ def _first_mask(
 
 
 def _differs_from_plate(photograph: Floats, plate: Floats) -> Bools:
-    white = max(float(np.quantile(photograph.max(axis=2), 0.995)), 1e-12)
+    white = max(float(np.quantile(largest_channel(photograph), 0.995)), 1e-12)
     shown, empty = (encode_srgb(np.clip(x / white, 0, 1)) for x in (photograph, plate))
-    difference = cv2.GaussianBlur(np.abs(shown - empty).max(axis=2), (0, 0), 1.0)
+    difference = cv2.GaussianBlur(largest_channel(np.abs(shown - empty)), (0, 0), 1.0)
     return np.asarray(difference > PLATE_DIFFERENCE)
 
 

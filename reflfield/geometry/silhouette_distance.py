@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -22,9 +23,6 @@ _HALF_PIECE = 0.75
 # Within this distance of the outline, pixels, distances are measured to its pieces;
 # beyond, to the nearest crossing (an error of at most _HALF_PIECE^2 / 2 / distance).
 _FINE_BAND = 4.0
-
-# Rows of an image whose distances are worked out together.
-_ROWS_AT_ONCE = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,19 +156,12 @@ def _checked(silhouette: NDArray[np.floating], name: str) -> NDArray[np.floating
 
 def _coarse_distance(covered: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance of pixel centres to the boundary between pixels, about half a pixel."""
-    values = np.zeros(covered.shape, np.float32)
-    columns = np.arange(covered.shape[1])
-    for part, sign in ((covered, 1.0), (~covered, -1.0)):
-        row, col = ndimage.distance_transform_edt(
-            part, return_distances=False, return_indices=True
-        )
-        # Some rows at a time: double precision of an image takes four times its memory.
-        for first in range(0, len(part), _ROWS_AT_ONCE):
-            some = slice(first, min(first + _ROWS_AT_ONCE, len(part)))
-            down = row[some] - np.arange(some.start, some.stop)[:, None]
-            distance = np.sqrt(np.square(down) + np.square(col[some] - columns))
-            values[some] += np.where(part[some], sign * (distance - 0.5), 0.0)
-    return values
+    inside, outside = (
+        cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        for part in (covered, ~covered)
+    )
+    half = np.float32(0.5)
+    return np.where(covered, inside - half, half - outside)
 
 
 def _rim_points(covered: NDArray[np.bool_]) -> Array:

@@ -66,7 +66,7 @@ MADE_VIEWS_PER_WRONG = 10
 # Fewer than so many of those are judged like silhouettes that are given.
 _MANY_MADE = 60
 # Median overlap of those with the hull from which they are taken to be of one object.
-_MADE_OVERLAP = 0.8
+MADE_OVERLAP = 0.8
 
 # Fewer views than these do not outweigh one that says the object is larger.
 LEAST_WITNESSES = 6
@@ -290,7 +290,7 @@ def _hull_of_made(
     except GeometryError:
         return None
     fit = _agreement(carved.mesh, [view.camera for view in views], silhouettes)
-    return _Outcome(carved, fit=fit) if np.median(fit.overlap) > _MADE_OVERLAP else None
+    return _Outcome(carved, fit=fit) if np.median(fit.overlap) > MADE_OVERLAP else None
 
 
 def _agreed_hull(
