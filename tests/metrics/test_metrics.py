@@ -27,6 +27,8 @@ from reflfield.metrics.image_metrics import (
 )
 from reflfield.render.exposure import ThinnedValues, display, object_pixels
 
+DB = 10 / math.log(10)  # decibels of a relative error of a mean square
+
 
 def disk(size, radius):
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
@@ -48,31 +50,35 @@ def frames(rng):
 # --- exact ------------------------------------------------------------------------
 
 
-def test_constant_error_gives_the_psnr_worked_out_by_hand():
+def test_constant_error_gives_the_psnr_worked_out_by_hand(rounding):
     """Percentile 0.5, so e = 2; HDR error 2 * 0.05 = 0.1 is 20 dB."""
     photograph = np.full((20, 20, 3), 0.5)
     result = compare_images([ImagePair("a", photograph, photograph - 0.05, np.ones((20, 20)))])
-    assert result.exposure == pytest.approx(2.0, rel=1e-12)
-    assert result.images[0].psnr_hdr == pytest.approx(20.0, abs=1e-9)
+    assert result.exposure == 2.0
+    sums = rounding(float, operations=3 * 16 * 16, scale=DB)
+    assert result.images[0].psnr_hdr == pytest.approx(20.0, abs=sums)
     # LDR: sRGB(1) = 1 against sRGB(0.9) = 1.055 * 0.9^(1/2.4) - 0.055.
     error = 1 - (1.055 * 0.9 ** (1 / 2.4) - 0.055)
-    assert result.images[0].psnr_ldr == pytest.approx(-20 * math.log10(error), abs=1e-9)
+    assert result.images[0].psnr_ldr == pytest.approx(-20 * math.log10(error), abs=sums)
     assert result.images[0].n_pixels == 16 * 16
 
 
-def test_overexposure_counts_in_hdr_only():
+def test_overexposure_counts_in_hdr_only(rounding):
     photograph = np.ones((20, 20, 3))
     frame = compare_images([ImagePair("a", photograph, 3 * photograph, np.ones((20, 20)))])
     assert frame.mean["psnr_ldr"] == PSNR_CAP_DB
-    assert frame.mean["psnr_hdr"] == pytest.approx(-20 * math.log10(2), abs=1e-9)
+    assert frame.mean["psnr_hdr"] == pytest.approx(
+        -20 * math.log10(2), abs=rounding(float, scale=DB)
+    )
 
 
-def test_exposure_is_the_percentile_over_all_frames(frames):
+def test_exposure_is_the_percentile_over_all_frames(frames, rounding):
     values = np.concatenate(
         [luminance(p.photograph)[object_pixels(p.silhouette)] for p in frames]
     )
     got = common_exposure((p.photograph, p.silhouette) for p in frames)
-    assert got == pytest.approx(1 / np.percentile(values, 99.5), rel=1e-12)
+    expected = 1 / np.percentile(values, 99.5)  # of luminances of three terms
+    assert got == pytest.approx(expected, rel=rounding(float, operations=3))
 
 
 @pytest.mark.reference
@@ -87,7 +93,7 @@ def test_erosion_keeps_what_is_farther_than_two_pixels_from_the_outside(rng):
 
 
 @pytest.mark.reference
-def test_ssim_and_flip_are_those_of_their_packages(frames):
+def test_ssim_and_flip_are_those_of_their_packages(frames, rounding):
     result = compare_images(frames)
     for pair, got in zip(frames, result.images, strict=True):
         counted = object_pixels(pair.silhouette)
@@ -104,19 +110,20 @@ def test_ssim_and_flip_are_those_of_their_packages(frames):
         )
         # FLIP's own default viewing conditions are the ones stated.
         assert used["ppd"] == pytest.approx(PIXELS_PER_DEGREE, rel=1e-6)
-        assert got.ssim == pytest.approx(similarity[counted].mean(), abs=1e-12)
-        assert got.flip == pytest.approx(error[counted].mean(), abs=1e-6)
+        assert got.ssim == pytest.approx(similarity[counted].mean(), abs=rounding(float, 3))
+        # One rounding of each pixel's error, of at most 1; over pixels they average out.
+        assert got.flip == pytest.approx(error[counted].mean(), abs=rounding(np.float32))
 
 
 def test_equal_pictures_are_perfect_and_the_file_stays_valid(frames):
     same = [ImagePair(p.name, p.photograph, p.photograph, p.silhouette) for p in frames]
     mean = json.loads(compare_images(same).to_json())["mean"]
     assert mean["psnr_ldr"] == mean["psnr_hdr"] == PSNR_CAP_DB
-    assert mean["ssim"] == pytest.approx(1, abs=1e-12)
+    assert mean["ssim"] == 1  # x / x everywhere
     assert mean["flip"] == 0
 
 
-def test_file_holds_exactly_what_is_promised(frames):
+def test_file_holds_exactly_what_is_promised(frames, rounding):
     content = json.loads(compare_images(frames).to_json())
     keys = {"name", "psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"}
     assert set(content) == {"images", "mean", "measured", "extra"}
@@ -132,7 +139,7 @@ def test_file_holds_exactly_what_is_promised(frames):
     }
     for key in keys - {"name"}:
         values = [image[key] for image in content["images"]]
-        assert content["mean"][key] == pytest.approx(np.mean(values), rel=1e-12)
+        assert content["mean"][key] == pytest.approx(np.mean(values), rel=rounding(float, 3))
     # Planted: 5 % too red, 5 % too little green; the noise averages out to < 1 %.
     assert content["extra"]["colour_ratio"] == pytest.approx([1.05, 0.95, 1.0], abs=0.01)
 
@@ -201,12 +208,13 @@ def test_frames_can_be_read_one_at_a_time(frames):
 
 
 @pytest.mark.stability
-def test_black_photographs_are_measured_with_a_warning():
+def test_black_photographs_are_measured_with_a_warning(rounding):
     black = np.zeros((16, 16, 3))
     result = compare_images([ImagePair("a", black, black + 0.1, np.ones((16, 16)))])
     assert result.exposure == 1
     assert "black" in result.warnings[0]
-    assert result.images[0].psnr_hdr == pytest.approx(20, abs=1e-9)
+    sums = rounding(float, operations=3 * 12 * 12, scale=DB)
+    assert result.images[0].psnr_hdr == pytest.approx(20, abs=sums)
     content = json.loads(result.to_json())
     assert content["extra"]["colour_ratio"] == [None, None, None]
 
@@ -227,7 +235,7 @@ def test_one_firefly_does_not_set_the_exposure():
     photograph = np.full((60, 60, 3), 0.5)
     photograph[30, 30] = 1e6
     result = compare_images([ImagePair("a", photograph, photograph, np.ones((60, 60)))])
-    assert result.exposure == pytest.approx(2, rel=1e-9)
+    assert result.exposure == 2
 
 
 @pytest.mark.stability
@@ -236,7 +244,7 @@ def test_smallest_pictures_that_have_object_pixels(size, rng):
     photograph = rng.uniform(size=(size, size, 3))
     result = compare_images([ImagePair("a", photograph, photograph, np.ones((size, size)))])
     assert result.images[0].n_pixels == (size - 4) ** 2
-    assert result.images[0].ssim == pytest.approx(1, abs=1e-12)
+    assert result.images[0].ssim == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -306,7 +314,7 @@ def test_no_frame_is_refused():
         compare_images([])
 
 
-def test_strips_measure_what_whole_frames_do(frames, monkeypatch, rng):
+def test_strips_measure_what_whole_frames_do(frames, monkeypatch, rng, rounding):
     """FLIP reaches 10 pixels, SSIM 3; a strip of 32 rows sees 32 more on both sides."""
     tall = [
         replace(
@@ -324,8 +332,12 @@ def test_strips_measure_what_whole_frames_do(frames, monkeypatch, rng):
     for name in ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"):
         # FLIP is single precision, its filters' sums begin elsewhere.
         assert by_strips.mean[name] == pytest.approx(whole.mean[name], rel=1e-5)
-    assert by_strips.colour_ratio == pytest.approx(whole.colour_ratio, rel=1e-12)
-    assert np.abs(flip_errors(tall[0], 1.0) - errors).max() < 1e-4
+    # NumPy sums 6,400 pixels by halves: 13 additions, and 15 of strips.
+    sums = rounding(float, operations=13 + 15)
+    assert by_strips.colour_ratio == pytest.approx(whole.colour_ratio, rel=sums)
+    # Colours and features pass two filters of 21 taps along each axis.
+    filters = rounding(np.float32, operations=2 * 2 * 21)
+    assert np.abs(flip_errors(tall[0], 1.0) - errors).max() < filters
 
 
 def test_many_values_are_thinned_evenly(rng):
