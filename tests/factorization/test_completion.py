@@ -28,14 +28,15 @@ def test_rank_one_hole_is_filled():
     assert fit.coefficients.shape == (5, 1)
 
 
-def test_reconstruct_selects_columns(rng):
+def test_reconstruct_selects_columns(rng, rounding):
     data = problem("random", rng, n_directions=8, n_columns=40, rank=3)
     fit = complete(holed(data), rank=3)
     whole = reconstructed(fit)
     np.testing.assert_array_equal(
         reconstructed(fit, slice(3, 7)), reconstructed(fit, np.arange(3, 7))
     )
-    np.testing.assert_allclose(reconstructed(fit, 5), whole[:, 5:6], rtol=1e-5, atol=1e-6)
+    products = rounding(np.float32, operations=3, scale=np.abs(whole).max())
+    np.testing.assert_allclose(reconstructed(fit, 5), whole[:, 5:6], rtol=0, atol=products)
 
 
 def test_empty_column_becomes_the_mean_and_empty_row_is_zero(rng):
@@ -75,7 +76,8 @@ def test_random_gaps_are_filled_to_the_noise_in_two_passes(rng):
     m, n = data.truth.shape
     bound = 0.01 * np.sqrt(2 * 6 * (m + n) / (m * n))
     assert unobserved_error(reconstructed(fit), data) < 1.3 * bound
-    assert fit.noise == pytest.approx(0.01, rel=0.05)
+    # Two passes leave it .01 low; the sampling error of 290,000 entries is .0013.
+    assert fit.noise == pytest.approx(0.01, rel=0.03)
     assert fit.residuals[-1] < 1.05 * 0.01
 
 
@@ -156,7 +158,8 @@ def test_channels_share_the_pattern(rng):
     three = three + 0.01 * rng.standard_normal(three.shape)
     shared = complete(three, data.observed, rank=3, n_channels=3, passes=6)
     repeated = complete(three, np.repeat(data.observed, 3, axis=0), rank=3, passes=6)
-    np.testing.assert_allclose(reconstructed(shared), reconstructed(repeated), atol=0.01)
+    # Sums in another order in six passes of doubles: observed 2e-9.
+    np.testing.assert_allclose(reconstructed(shared), reconstructed(repeated), atol=1e-7)
 
 
 # --- sources -----------------------------------------------------------------------------
@@ -221,7 +224,8 @@ def test_unit_does_not_matter(rng, scale, dtype, bounded):
         source="the noise of the data",
         dtype=dtype,
     )
-    assert fit.noise / scale == pytest.approx(0.01, rel=0.1)
+    # Sampling error of the 4,600 entries beyond the parameters: .01; observed .005 to .04 low.
+    assert fit.noise / scale == pytest.approx(0.01, rel=0.07)
 
 
 @pytest.mark.stability
@@ -254,11 +258,13 @@ def test_duplicate_zero_and_single_columns(rng):
     same = np.repeat(column, 30, axis=1)
     seen = rng.random(same.shape) < 0.7
     fit = complete(same, seen, rank=3)
-    np.testing.assert_allclose(reconstructed(fit), same, atol=1e-3)
+    # The passes end with a noise of 1e-6 to 4e-6, which draws by as much: observed 3e-6.
+    np.testing.assert_allclose(reconstructed(fit), same, atol=3e-5)
     assert np.abs(reconstructed(complete(np.zeros((20, 10)), rank=2))).max() == 0
     one = complete(column, rank=5)
     assert one.rank == 1
-    np.testing.assert_allclose(reconstructed(one), column, atol=1e-4)
+    # Here with 4e-11: observed 4e-12.
+    np.testing.assert_allclose(reconstructed(one), column, atol=1e-9)
 
 
 @pytest.mark.stability

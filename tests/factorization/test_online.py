@@ -23,9 +23,9 @@ def departure(basis):
     return np.abs(wide.T @ wide - np.eye(wide.shape[1])).max()
 
 
-def test_hand_checked():
+def test_hand_checked(rounding):
     svd = OnlineSVD(2, np.float64).update(np.array([[0.0, 3.0], [-2.0, 0.0]]))
-    np.testing.assert_allclose(svd.singular_values, [3, 2], rtol=1e-14)
+    np.testing.assert_allclose(svd.singular_values, [3, 2], rtol=rounding(float))
     # Signs: the largest entry of each vector is positive.
     np.testing.assert_allclose(svd.basis, np.eye(2), atol=1e-15)
     assert svd.n_columns == 2
@@ -74,7 +74,8 @@ def test_low_rank_is_kept_whatever_the_blocks(n_rows, block, true_rank, seed):
     rng = np.random.default_rng(seed)
     matrix = rng.standard_normal((n_rows, true_rank)) @ rng.standard_normal((true_rank, 50))
     svd = fed(matrix, 6, block)
-    assert departure(svd.basis) < 1e-13
+    # An update's rounding, of 50 columns one by one.
+    assert departure(svd.basis) < 8 * np.finfo(float).eps * 50
     back = svd.basis @ (svd.basis.T @ matrix)
     assert np.abs(back - matrix).max() < 1e-11 * max(1.0, np.abs(matrix).max())
 

@@ -51,15 +51,16 @@ class TestClusters:
         # Five components in float32.
         assert np.abs(predicted(model) - columns).max() < 1e-5 * np.abs(columns).max()
 
-    def test_pairs_of_nodes_that_no_texel_showed_are_as_their_neighbours(self, rng):
+    def test_pairs_of_nodes_that_no_texel_showed_are_as_their_neighbours(self, rng, rounding):
         albedo = 1 + rng.random(60)
         columns = np.repeat(albedo[None], COUNTS[0] * COUNTS[1] * 3, axis=0)
         columns.reshape(*COUNTS, 3, -1)[1, 4:] = np.nan
         completion = complete(columns, rank=1)
         model = clustered(completion, n_clusters=1, n_components=1)
-        # The completion's prior draws rows towards zero by a share of the noise.
+        # The completion's prior draws rows towards zero by a share of the noise, which is none
+        # here: a mean and one component in singles are left.
         shown = predicted(model)
-        assert np.abs(shown / albedo[:, None] - 1).max() < 1e-3
+        assert np.abs(shown / albedo[:, None] - 1).max() < rounding(np.float32, operations=2)
 
     def test_more_clusters_and_components_fit_better(self, completed):
         completion, columns = completed
@@ -114,13 +115,14 @@ class TestClusters:
 
 
 class TestPrecision:
-    def test_is_noise_over_variance(self, rng):
+    def test_is_noise_over_variance(self, rng, rounding):
         labels = np.repeat(np.arange(2, dtype=np.int32), 50)
         coefficients = rng.normal(size=(100, 3))
         precision = _precision(labels, coefficients, 0.3, 2)
         for c in range(2):
             expected = 0.09 / coefficients[labels == c].var(axis=0)
-            assert np.allclose(precision[c], np.diag(expected), rtol=1e-12)
+            tolerance = rounding(np.float64, operations=50)  # a variance of 50
+            np.testing.assert_allclose(precision[c], np.diag(expected), rtol=tolerance)
 
     @pytest.mark.stability
     def test_clusters_without_members(self, rng):

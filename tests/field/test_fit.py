@@ -143,7 +143,8 @@ class TestCoefficients:
             determined = np.trace(np.linalg.solve(full + prior.T @ prior, full))
             share = 1 - determined / np.count_nonzero(weights[t])
             freedom = weights[t].sum() * share
-            assert np.isclose(squares[t, 1], freedom, rtol=1e-5)
+            # Two components' normal equations in singles.
+            assert squares[t, 1] == pytest.approx(freedom, rel=rounding(np.float32, 4))
 
     def test_planted_coefficients(self, rng, pool):
         model = planted_model(rng, 40)
@@ -187,11 +188,11 @@ class TestCoefficients:
         )
         assert np.allclose(squares[:, 0], rest.sum(axis=(1, 2, 3)), rtol=1e-4)  # float32 sums
         weight = 3 * sample_weights(samples).sum(axis=(1, 2))
-        assert np.allclose(squares[:, 1], weight, rtol=1e-6)
+        np.testing.assert_allclose(squares[:, 1], weight, rtol=rounding(np.float32))
 
 
 class TestNormalised:
-    def test_predictions_stay_and_coefficients_are_white(self, rng):
+    def test_predictions_stay_and_coefficients_are_white(self, rng, rounding):
         model = planted_model(rng, 60)
         mixed = model.coefficients @ np.array([[2, 1], [0, 0.5]]) + [3, -1]
         model = replace(model, coefficients=mixed.astype(np.float32))
@@ -200,10 +201,13 @@ class TestNormalised:
         samples = empty_samples(rng, 60, 3, 3)
         one, two = predicted(samples, model), predicted(samples, white)
         assert np.abs(one - two).max() < 1e-5 * np.abs(one).max()  # float32, sums of three
+        # Singles of size 5 are divided by their deviations, of which the least is about .45.
+        singles = rounding(np.float32, condition=5 / 0.45)
         for c in range(2):
             members = chosen[model.cluster[chosen] == c]
-            assert np.abs(white.coefficients[members].mean(axis=0)).max() < 1e-5
-            assert np.allclose(np.cov(white.coefficients[members].T), np.eye(2), atol=1e-5)
+            assert np.abs(white.coefficients[members].mean(axis=0)).max() < singles
+            covariance = np.cov(white.coefficients[members].T)
+            np.testing.assert_allclose(covariance, np.eye(2), rtol=0, atol=singles)
             assert np.allclose(white.precision[c], 0.04 * np.eye(2))
 
     @pytest.mark.stability

@@ -128,8 +128,9 @@ def test_samples_are_those_of_an_independent_evaluation(model):
     values = evaluate(built(model), texels, views, lights)
     # Singles: 33 nodes over an arc hyperbolic sine of an arc cosine lose some digits near the
     # pole; random tables differ by 1 from node to node. Frames are stored to .01 degrees.
-    np.testing.assert_allclose(values, exact, atol=0.02)
-    assert np.abs(values - exact).mean() < 1e-3
+    # Observed: .0019 at most, .00026 on average.
+    np.testing.assert_allclose(values, exact, atol=0.006)
+    assert np.abs(values - exact).mean() < 8e-4  # three times what was observed
 
 
 def test_texels_that_do_not_exist_and_lights_below_give_nothing(model):
