@@ -74,10 +74,10 @@ def test_bases_are_orthonormal_and_coefficients_are_projections(rng, rounding):
 
 
 def test_history_never_rises(rng, rounding):
-    # Noise as large as the clusters: otherwise the start is the answer.
-    columns, _ = clustered_subspaces(rng, n_clusters=12, n_columns=2000, noise=3.0)
-    history = LocalPCA(n_clusters=12, n_components=3).fit(columns).history
-    assert len(history) > 1
+    # Noise alone: of planted clusters the start is the answer.
+    columns = rng.standard_normal((16, 2000)).astype(np.float32)
+    history = LocalPCA(n_clusters=6, n_components=3).fit(columns).history
+    assert len(history) > 5
     assert (np.diff(history) <= rounding(np.float32)).all()
 
 
