@@ -99,8 +99,9 @@ class TestMouse:
         drag(page, start, [(start[0] - 30, start[1] + 40), (start[0] - 60, start[1] + 60)])
         settled(page)
         after = dot.bounding_box()
-        assert after["x"] + 22 == pytest.approx(start[0] - 60, abs=3)
-        assert after["y"] + 22 == pytest.approx(start[1] + 60, abs=3)
+        row = 3  # the image is coarser while it moves, of whole rows: observed 2.1 pixels
+        assert after["x"] + 22 == pytest.approx(start[0] - 60, abs=row)
+        assert after["y"] + 22 == pytest.approx(start[1] + 60, abs=row)
         assert "behind" not in dot.get_attribute("class")
         middle = page.evaluate("(() => { const v = reflfield.viewer();"
                                " return v.free(innerWidth, innerHeight); })()")  # fmt: skip
@@ -139,7 +140,8 @@ class TestPanel:
         assert lamps == 3
 
     @pytest.mark.parametrize("name", ["studio", "sky"])
-    def test_surroundings_are_few_lights_of_known_sum(self, page, name):
+    def test_surroundings_are_few_lights_of_known_sum(self, page, name, rounding):
+        tolerance = rounding(np.float64, operations=64, scale=4)
         page.locator(f"input[name=map][value={name}]").check(force=True)
         page.locator("#map-rotation").fill("90")
         page.locator("#map-strength").fill("1")
@@ -151,9 +153,9 @@ class TestPanel:
         assert len(lights["moving"]) == 8
         for some in lights.values():
             total = np.sum([light["power"] for light in some], axis=0)
-            assert total @ [0.2126, 0.7152, 0.0722] == pytest.approx(4.0, rel=1e-4)
+            assert total @ [0.2126, 0.7152, 0.0722] == pytest.approx(4.0, abs=tolerance)
             lengths = np.linalg.norm([light["at"] for light in some], axis=1)
-            np.testing.assert_allclose(lengths, 1, atol=1e-9)
+            np.testing.assert_allclose(lengths, 1, rounding(np.float64))
 
     def test_picture(self, page):
         page.locator("#exposure").fill("1.5")
@@ -185,7 +187,8 @@ class TestPanel:
         page.locator("#photo").select_option("0")
         settled(page)
         box = page.locator("#photograph").bounding_box()
-        assert box["width"] / box["height"] == pytest.approx(80 / 60, rel=0.01)
+        # Chromium lays out in 64ths of a pixel.
+        assert box["width"] == pytest.approx(80 / 60 * box["height"], abs=2 / 64)
         assert page.locator("#hint").text_content() == "Held out."
         page.locator("#wipe").fill("25")
         settled(page)
@@ -260,7 +263,8 @@ def test_a_link_restores_the_view(page, open_page, html):
     wanted, fragment = scene(page), page.url.partition("#")[2]
     restored = scene(open_page(html, fragment))
     for name in ("azimuth", "elevation", "distance", "target"):
-        assert restored["camera"][name] == pytest.approx(wanted["camera"][name], rel=1e-4)
+        # The link has five digits.
+        assert restored["camera"][name] == pytest.approx(wanted["camera"][name], rel=5e-5)
     for name in ("flash", "exposure", "curve", "show", "backdrop", "photo", "map"):
         assert restored[name] == wanted[name]
     assert [lamp["on"] for lamp in restored["lamps"]] == [True, False, True]
@@ -326,24 +330,26 @@ class TestMaps:
         return (power @ np.array([light["at"] for light in lights])) / power.sum()
 
     @pytest.mark.parametrize("compression", ["none", "zip", "zips"])
-    def test_exr(self, page, radiance, tmp_path, compression):
+    def test_exr(self, page, radiance, tmp_path, compression, rounding):
         path = tmp_path / "map.exr"
         write_map(path, radiance, compression)
         lights = self.dropped(page, path.name, path.read_bytes())
         assert scene(page)["map"]["name"] == "file"
-        np.testing.assert_allclose(
-            self.lights_shown(lights), self.expected(radiance), atol=2e-3
-        )
+        tolerance = rounding(np.float64, operations=radiance[..., 0].size)
+        shown = self.lights_shown(lights)
+        np.testing.assert_allclose(shown, self.expected(radiance), rtol=0, atol=tolerance)
 
     @pytest.mark.parametrize("coded", [False, True])
-    def test_hdr(self, page, radiance, coded):
+    def test_hdr(self, page, radiance, coded, rounding):
         codes, kept = rgbe(radiance)
         rows = [hdr_row(row, coded) for row in codes]
         content = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n" + b"".join(rows)
         lights = self.dropped(page, "map.hdr", content)
-        np.testing.assert_allclose(self.lights_shown(lights), self.expected(kept), atol=2e-3)
+        tolerance = rounding(np.float64, operations=kept[..., 0].size)
+        shown = self.lights_shown(lights)
+        np.testing.assert_allclose(shown, self.expected(kept), rtol=0, atol=tolerance)
 
-    def test_picture_is_srgb(self, page, rng):
+    def test_picture_is_srgb(self, page, rng, rounding):
         codes = rng.integers(40, 255, (16, 32, 3)).astype(np.uint8)
         stream = io.BytesIO()
         Image.fromarray(codes).save(stream, "PNG")
@@ -351,7 +357,8 @@ class TestMaps:
         share = codes / 255.0
         linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
         wanted = self.expected(linear.astype(np.float32))
-        np.testing.assert_allclose(self.lights_shown(lights), wanted, atol=2e-3)
+        tolerance = rounding(np.float32)  # in which texels are kept
+        np.testing.assert_allclose(self.lights_shown(lights), wanted, rtol=0, atol=tolerance)
 
     @pytest.mark.parametrize(
         ("name", "content", "why"),
