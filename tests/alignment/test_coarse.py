@@ -57,10 +57,10 @@ def test_maxima_at_the_tilt_limit_have_a_start_inside_it(rng):
         assert np.isfinite(heights).all()
 
 
-def test_tilting_back_keeps_what_is_allowed():
+def test_tilting_back_keeps_what_is_allowed(rounding):
     turns = Rotation.random(50, random_state=2).as_matrix()
     back = tilted_back(turns, 0.8)
     inside = turns[:, 2, 2] >= np.cos(0.8)
-    np.testing.assert_allclose(back[inside], turns[inside], atol=1e-15)
-    np.testing.assert_allclose(back[~inside, 2, 2], np.cos(0.8), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(back), 1.0, atol=1e-12)
+    np.testing.assert_array_equal(back[inside], turns[inside])  # turned by no angle
+    np.testing.assert_allclose(back[~inside, 2, 2], np.cos(0.8), rtol=rounding(float, 3))
+    np.testing.assert_allclose(np.linalg.det(back), 1.0, rtol=rounding(float, 9))

@@ -62,10 +62,10 @@ def test_turning_each_base_frame_turns_the_answer_along(relief, rng):
     turned = SampleSet(data.samples, data.views @ back, data.lights @ back)
     _, frames = refined(data, start)
     _, other = refined(turned, start @ back)
-    # Six Gauss-Newton steps against targets in float32, of condition about a hundred; a texel
-    # whose step is judged the other way by rounding may end a quarter of a small step apart.
+    # Six Gauss-Newton steps against targets in float32, of condition about a hundred.
     error = np.abs(other @ turn - frames).max(axis=(1, 2))
     assert np.median(error) < 1e2 * 6 * np.finfo(np.float32).eps
+    # A step that rounding judges the other way ends a quarter of a small one apart.
     assert error.max() < 1e-3
 
 
@@ -128,6 +128,7 @@ def test_prior_keeps_a_texel_of_one_sample_and_gives_way_to_many(relief, sharp, 
     # Thousands, with an error of the coarse target alone, outweigh it.
     held = error_of(improved(relief, sharp, data.samples, SPREAD), truth)
     free = error_of(improved(relief, sharp, data.samples, np.inf), truth)
+    # What is left of the prior: observed .04.
     np.testing.assert_allclose(held, free, rtol=0.1)
     np.testing.assert_array_less(
         error_of(improved(relief, sharp, data.samples, 1e-4 * SPREAD), start),

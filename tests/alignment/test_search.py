@@ -11,6 +11,9 @@ from reflfield.sphere.coupling import Coupled, couple, rotate_coupled, uncouple
 from reflfield.sphere.rotations import rotation_angle
 from reflfield.sphere.wigner import rotation_blocks
 
+# Of a correlation in singles, relative to the norms (`test_correlation_is_exact`).
+SINGLES = 5e-6
+
 
 def lobes(rng, n, band_limit, dtype=np.float64):
     """Random functions whose energy falls with the degree, like reflectances."""
@@ -44,12 +47,13 @@ def test_correlation_is_exact(band_limit, dtype, bound, references, rng):
 
 
 @pytest.mark.reference
-def test_the_papers_forms_agree_with_the_exact_one(references, rng):
+def test_the_papers_forms_agree_with_the_exact_one(references, rng, rounding):
     a, b = lobes(rng, 2, 4)
     turn = Rotation.random(random_state=3).as_matrix()
     exact = references.double_wigner_sum(a, b, turn)
-    assert references.quadrature_sum(a, b, turn) == pytest.approx(exact, rel=1e-11)
-    assert references.rank_k_sum(a, b, turn, 16) == pytest.approx(exact, rel=1e-11)
+    sums = rounding(float, operations=16 * 16, scale=np.linalg.norm(a) * np.linalg.norm(b))
+    assert references.quadrature_sum(a, b, turn) == pytest.approx(exact, abs=sums)
+    assert references.rank_k_sum(a, b, turn, 16) == pytest.approx(exact, abs=sums)
     assert abs(references.rank_k_sum(a, b, turn, 4) - exact) > 1e-6 * abs(exact)
 
 
@@ -155,6 +159,7 @@ def test_climbing_one_of_two_sides_loses_nothing(half_turns, rng, monkeypatch):
     noise = 0.3 * lobes(rng, 100, 6)
     source = couple(uncouple(source) + noise)
     short = search(source, target, half_turns=half_turns)
+    tie = rotation_search.SYMMETRIC_SHARE
     monkeypatch.setattr(rotation_search, "SYMMETRIC_SHARE", 0.0)
     full = search(source, target, half_turns=half_turns)
     # Of two sides within a thousandth, the full search keeps the one that it ascends first.
@@ -162,7 +167,8 @@ def test_climbing_one_of_two_sides_loses_nothing(half_turns, rng, monkeypatch):
     same = short.score <= full.score * (1 + 1e-6)
     assert same.mean() > 0.9
     assert error_of(short.rotations, full.rotations)[same].max() < 0.05
-    np.testing.assert_allclose(short.margin, full.margin, atol=5e-3)
+    # As large as what one of the two sides may lack: observed 3e-4.
+    np.testing.assert_allclose(short.margin, full.margin, rtol=0, atol=tie)
 
 
 def nearly_round(target, rest):
@@ -198,7 +204,7 @@ def test_scale_does_not_matter(scale, rng):
     source = turned_copies(target, truth)
     plain, scaled = search(source, target), search(source.scaled(np.full(5, scale)), target)
     assert error_of(scaled.rotations, plain.rotations).max() < 0.01
-    np.testing.assert_allclose(scaled.score, plain.score, atol=1e-5)
+    np.testing.assert_allclose(scaled.score, plain.score, rtol=0, atol=SINGLES)
 
 
 @pytest.mark.stability
@@ -243,7 +249,7 @@ def test_round_lobe_has_no_margin_and_a_zero_function_no_score(rng):
     axial[0, zonal[:, None], zonal[None, :]] = rng.standard_normal((5, 5))
     target = couple(axial)
     maxima = search(target, target)
-    assert maxima.margin[0] < 1e-3
+    assert maxima.margin[0] < 2 * SINGLES
     nothing = search(target.scaled(np.zeros(1)), target)
     assert nothing.score[0] == 0.0
     assert nothing.margin[0] == 0.0

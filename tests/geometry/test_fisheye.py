@@ -31,5 +31,6 @@ def test_the_same_ball_is_carved():
     mesh, report = visual_hull(bent, [rigs.ball_silhouette(c, samples=2) for c in bent], RAW)
     # a third of the resolution of the plain cameras: .04 pixel or .001 of the radius
     assert mesh.volume == pytest.approx(expected.volume, rel=0.01)
-    assert np.abs(mesh.bounds).max() == pytest.approx(1.0, abs=0.03)
+    # Cones meet in corners, by a fifth of a voxel of .07 at most: observed .008.
+    np.testing.assert_allclose(mesh.bounds, expected.bounds, atol=0.014)
     assert report.overlap.min() > 0.97

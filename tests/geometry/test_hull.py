@@ -62,6 +62,7 @@ def test_cleaning_keeps_the_shape_closed():
     mesh, report = ball_hull(options=HullOptions(resolution=64, n_triangles=3000))
     assert mesh.watertight
     assert len(mesh.faces) == report.n_triangles <= 3000
+    # Smoothing adds .0005, 3,000 triangles take .003.
     assert mesh.volume == pytest.approx(raw.volume, rel=5e-3)
 
 
@@ -109,7 +110,8 @@ def test_place_and_size_do_not_matter(centre, scale):
     mesh, _ = ball_hull(options=options, silhouette=silhouette, centre=centre, scale=scale)
     reference, _ = ball_hull(options=options)
     assert mesh.watertight
-    assert mesh.volume / scale**3 == pytest.approx(reference.volume, rel=2e-3)
+    # At 1e3 m doubles keep 1e-13 m: observed 6e-13.
+    assert mesh.volume / scale**3 == pytest.approx(reference.volume, rel=1e-10)
     np.testing.assert_allclose(mesh.bounds.mean(axis=0), centre, atol=0.02 * scale)
 
 
@@ -205,6 +207,7 @@ def test_one_of_ten_made_silhouettes_may_miss_a_part():
     options = HullOptions(resolution=32, blur=0.0, smoothing=0, n_triangles=0)
     mesh, report = visual_hull(views, silhouettes, options, made=True)
     whole, _ = visual_hull(views, [rigs.ball_silhouette(v, samples=2) for v in views], options)
+    # As a few may be wrong, all of them carve less: observed .020 more is left.
     assert mesh.volume == pytest.approx(whole.volume, rel=0.03)
     assert sorted(np.argsort(report.overlap)[:3]) == [20, 60, 61]
     assert not report.left_out

@@ -30,16 +30,16 @@ def both(first, second):
     return Mesh(np.concatenate([first.vertices, second.vertices]), faces)
 
 
-def test_box_has_the_area_and_volume_of_a_box():
-    assert box().area == pytest.approx(22.0, rel=1e-14)
-    assert box().volume == pytest.approx(6.0, rel=1e-14)
+def test_box_has_the_area_and_volume_of_a_box(rounding):
+    assert box().area == pytest.approx(22.0, rel=rounding(float, 3))
+    assert box().volume == pytest.approx(6.0, rel=rounding(float, 3))
     assert box().watertight
 
 
-def test_vertex_normals_do_not_depend_on_the_triangulation():
+def test_vertex_normals_do_not_depend_on_the_triangulation(rounding):
     # Corners of a box see three square sides under equal angles, however those are cut.
     expected = np.sign(box().vertices) / np.sqrt(3.0)
-    np.testing.assert_allclose(box().vertex_normals, expected, atol=1e-14)
+    np.testing.assert_allclose(box().vertex_normals, expected, rtol=rounding(float, 3))
 
 
 def test_volume_keeps_its_digits_far_from_the_origin():
@@ -129,7 +129,11 @@ def test_ply_comes_back_exactly_and_trimesh_reads_it(tmp_path, rng):
     np.testing.assert_array_equal(again.vertices, mesh.vertices)
     np.testing.assert_array_equal(again.faces, mesh.faces)
     other = trimesh.load_mesh(tmp_path / "deep" / "ball.ply", process=False)
-    np.testing.assert_allclose(other.vertex_normals, mesh.vertex_normals, atol=1e-6)
+    np.testing.assert_array_equal(other.vertices, mesh.vertices)
+    # trimesh computes normals of its own; the stored ones are singles.
+    stored = other.metadata["_ply_raw"]["vertex"]["data"]
+    for name, values in zip(("nx", "ny", "nz"), mesh.vertex_normals.T, strict=True):
+        np.testing.assert_array_equal(stored[name], values.astype(np.float32))
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["ball.ply"]
 
 

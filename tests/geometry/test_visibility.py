@@ -82,6 +82,7 @@ def test_occlusion_and_hits_agree_with_brute_force(rng):
     hit = np.isfinite(truth)
     np.testing.assert_allclose(distance[hit], truth[hit], rtol=1e-5, atol=1e-5)  # float32
     points = np.einsum("nk,nkd->nd", barycentric[hit], mesh.corners[face[hit]])
+    # The error of the distance, and as much of the barycentric coordinates.
     np.testing.assert_allclose(points, origins[hit] + truth[hit, None] * ways[hit], atol=2e-5)
     np.testing.assert_array_equal(scene.occluded(origins, ways), hit)
     limit = np.where(hit, truth * rng.choice([0.99, 1.01], size=len(truth)), 5.0)
