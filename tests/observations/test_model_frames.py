@@ -113,7 +113,8 @@ def test_a_spread_of_nothing_keeps_the_frames(planted, model):
     reader, _ = planted
     some = np.arange(0, N, 2)
     held = refined_frames(reader, model, some, 1e-9)
-    assert angles(held, reader.local_from_world[some]).max() < 1e-4
+    # By less than the spread: observed 3e-13 degrees.
+    assert angles(held, reader.local_from_world[some]).max() < np.degrees(1e-9)
 
 
 def test_blocks_do_not_change_the_frames(planted, model):
@@ -131,7 +132,7 @@ def test_texels_without_samples_keep_their_frames(planted, model):
     reader.store.observed.lights[8] = False
     refined = refined_frames(reader, model, np.arange(N), SPREAD)
     assert np.isfinite(refined).all()
-    np.testing.assert_allclose(refined[[5, 8]], reader.local_from_world[[5, 8]], atol=1e-6)
+    np.testing.assert_array_equal(refined[[5, 8]], reader.local_from_world[[5, 8]])
 
 
 def test_normal_equations_are_the_slopes_of_the_squares(model, rng):

@@ -232,9 +232,9 @@ class TestProjection:
         y, x = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
         centres = np.stack([x + 0.5 - WIDTH / 2, HEIGHT / 2 - y - 0.5, 0 * x], axis=1)
         got = project(capture_of(images, sun), centres)[:, 0, 0]
-        # Halves round to eleven bits, and float32 once before; below 2^-14 of the unit, which
-        # is within a factor of 8 of the median over `USUAL_SAMPLE`, to 2^-25 of it.
+        # The unit is within a factor of 8 of the median over `USUAL_SAMPLE`.
         least = 2.0**-25 * 8 * np.median(images) / USUAL_SAMPLE
+        # Halves round to eleven bits, and float32 once before; below 2^-14 to 2^-25.
         np.testing.assert_allclose(
             got * scale, images[0, 0].reshape(-1, 3), rtol=2**-10.9, atol=least
         )
@@ -304,11 +304,12 @@ class TestClipping:
         codes = np.full((HEIGHT, WIDTH, 3), 100)
         codes[1, 1], codes[4, 4] = 1, 0
         values, projected, stored = measure(codes)
-        # Of numbers spread evenly below half a code the mean cube root is three quarters of
-        # the largest; halves round to 2^-25 of the unit.
+        half = 2.0**-25  # what halves round to, of the unit
         least = 1 / 255 / 12.92
-        np.testing.assert_allclose(values[1, 1], least, atol=2.0**-25)
-        np.testing.assert_allclose(values[4, 4], 0.75**3 * least / 2, atol=2.0**-25)
+        np.testing.assert_allclose(values[1, 1], least, rtol=0, atol=half)
+        # Of numbers spread evenly below half a code the mean cube root is three quarters of
+        # the largest.
+        np.testing.assert_allclose(values[4, 4], 0.75**3 * least / 2, rtol=0, atol=half)
         assert projected.count("black") == 3
         assert stored.gaps == 0
 

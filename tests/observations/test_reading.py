@@ -61,7 +61,7 @@ class TestSides:
 
 
 class TestReader:
-    def test_values_are_samples_over_cosines(self, reader, rng):
+    def test_values_are_samples_over_cosines(self, reader, rounding):
         texels = np.array([31, 4])
         got = reader.transformed(texels)
         stored = reader.store.read(texels).reshape(2, 6, 7, 3).astype(float)
@@ -71,8 +71,10 @@ class TestReader:
                 normal = reader.local_from_world[t, 2]
                 cosine = normal @ towards / np.linalg.norm(towards)
                 if cosine > 0.1:  # above the softened band
-                    assert np.allclose(got.values[i, :, j], stored[i, :, j] / cosine, rtol=1e-5)
-                    assert np.isclose(got.light_weights[i, j], cosine**2, rtol=1e-5)
+                    singles = rounding(np.float32, condition=1 / 0.1)  # of the cosine
+                    expected = stored[i, :, j] / cosine
+                    np.testing.assert_allclose(got.values[i, :, j], expected, rtol=singles)
+                    assert got.light_weights[i, j] == pytest.approx(cosine**2, rel=singles)
 
     def test_what_is_not_observed_has_no_weight(self, reader_of, rng):
         lights = rng.random((9, 4)) < 0.5
@@ -197,7 +199,7 @@ class TestLuminance:
             np.testing.assert_allclose(luminance.lights[i], expected, atol=4 * eps)
         assert luminance.views.shape == (2, 6, 3)
 
-    def test_directions_that_do_not_vary_become_one(self, reader_of, rng):
+    def test_directions_that_do_not_vary_become_one(self, reader_of, rng, rounding):
         unknown = tuple(Light(f"l{i}", "unknown") for i in range(3))
         samples = rng.random((4, 1, 3, 3))
         lights = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 0]], bool)
@@ -206,14 +208,13 @@ class TestLuminance:
         assert luminance.samples.shape == (4, 1, 1)
         value = samples.astype(np.float16).astype(float) @ [0.2126, 0.7152, 0.0722]
         assert np.isnan(luminance.samples[2, 0, 0])
-        np.testing.assert_allclose(
-            luminance.samples[1, 0, 0], value[1, 0, [0, 2]].mean(), rtol=1e-6
-        )
+        mean = value[1, 0, [0, 2]].mean()
+        assert luminance.samples[1, 0, 0] == pytest.approx(mean, rel=rounding(np.float32))
         np.testing.assert_array_equal(luminance.lights, np.tile([0.0, 0, 1], (4, 1, 1)))
 
 
 class TestShade:
-    def test_is_the_mean_over_views_of_what_lies_in_shadow(self, reader_of, rng):
+    def test_is_the_mean_over_views_of_what_lies_in_shadow(self, reader_of, rng, rounding):
         samples = rng.random((12, 4, 5, 3))
         views, lights = rng.random((12, 4)) < 0.7, rng.random((12, 5)) < 0.5
         reader = reader_of(dome(4, 5), samples, domain="cube_root", views=views, lights=lights)
@@ -225,4 +226,5 @@ class TestShade:
                 seen = views[t] if not lights[t, j] else np.zeros(4, bool)
                 assert (shade.weights[k, j] == seen.sum()).all()
                 expected = stored[t, seen, j].mean(axis=0) if seen.any() else np.zeros(3)
-                np.testing.assert_allclose(shade.values[k, j], expected, rtol=1e-6)
+                tolerance = rounding(np.float32)
+                np.testing.assert_allclose(shade.values[k, j], expected, rtol=tolerance)

@@ -49,9 +49,10 @@ def irradiance(directions, irradiances, normals):
 
 
 @pytest.mark.parametrize("convention", AXES)
-def test_axes_lie_where_the_formats_say(convention):
+def test_axes_lie_where_the_formats_say(convention, rounding):
     for (u, v), axis in AXES[convention].items():
-        assert np.allclose(direction_from_uv(u, v, convention), axis, atol=1e-12)
+        direction = direction_from_uv(u, v, convention)
+        np.testing.assert_allclose(direction, axis, rtol=0, atol=rounding(float))
 
 
 @pytest.mark.parametrize("convention", AXES)
@@ -117,16 +118,17 @@ def test_a_map_stands_upright_in_the_world_of_the_field(convention, up):
         assert source._lights.directions[0] @ np.array(axis) > np.cos(0.0695)
 
 
-def test_rotation_turns_the_map_to_the_left_seen_from_above():
+def test_rotation_turns_the_map_to_the_left_seen_from_above(rounding):
     """Independent of the map's code: SciPy's rotation about the up axis, of an oblique one."""
     up = np.array([1.0, 2.0, -2.0])
     sky = one_pixel(0.4, 0.3, "openexr")
     at_rest = sky.turned_to(up).quantise(1).directions[0]
     turned = sky.turned_to(up, 30.0).quantise(1).directions[0]
     expected = Rotation.from_rotvec(np.radians(30) * up / 3).apply(at_rest)
-    assert np.allclose(turned, expected, atol=1e-12)
+    tolerance = rounding(float, operations=9)
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=tolerance)
     # Elevation: row 9 of 32 is 9.5 / 32 * 180 = 53.4 degrees from the zenith.
-    assert np.allclose(turned @ up / 3, np.cos(np.pi * 9.5 / 32), atol=1e-12)
+    assert turned @ up / 3 == pytest.approx(np.cos(np.pi * 9.5 / 32), abs=tolerance)
 
 
 def test_an_environment_of_a_capture_stays_as_described(tmp_path):
@@ -212,9 +214,9 @@ def test_pixels_of_coarse_maps_light_from_all_of_their_area(height):
     """One row would light from the horizon alone."""
     lights = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32)).quantise(256)
     for normal in np.vstack([np.eye(3), -np.eye(3)]):
-        # Rows of 11 degrees are off by 0.8 %.
         sent = irradiance(lights.directions, lights.irradiances, normal[None])
-        np.testing.assert_allclose(sent, np.pi, rtol=0.02)
+        # Rows of 11 degrees are off by 0.8 %.
+        np.testing.assert_allclose(sent, np.pi, rtol=0.01)
 
 
 def test_solid_angles_fill_the_sphere(rounding):
@@ -260,11 +262,13 @@ def test_a_small_sun_gets_a_light_of_its_own(rng):
     assert lights.directions[strongest] @ sky.directions[20, 30] > np.cos(0.01)
 
 
-def test_large_maps_are_reduced_first_without_loss(rng):
+def test_large_maps_are_reduced_first_without_loss(rng, rounding):
     sky = random_map(rng, 300)
     lights = sky.quantise(100)
     expected = (sky.radiance * sky.solid_angles[:, None, None]).sum(axis=(0, 1))
-    assert np.allclose(lights.irradiances.sum(axis=0), expected, rtol=1e-9)
+    # Roundings of 300 x 600 additions wander as the root of their number.
+    sums = rounding(float, operations=np.sqrt(300 * 600))
+    np.testing.assert_allclose(lights.irradiances.sum(axis=0), expected, rtol=sums)
 
 
 def test_black_maps_send_nothing():
@@ -291,7 +295,7 @@ def test_white_furnace(visibility):
     assert np.abs(share - 1).max() < 0.03
 
 
-def test_map_equals_its_lights_one_by_one(rng):
+def test_map_equals_its_lights_one_by_one(rng, rounding):
     """A parallel view of a plane: texel by texel and pixel by pixel are the same then."""
     from reflfield.capture.cameras import Camera, looking_at
 
@@ -307,7 +311,9 @@ def test_map_equals_its_lights_one_by_one(rng):
     ]
     by_map = render(field, camera, sky, options).image
     one_by_one = render(field, camera, suns, options).image
-    assert np.allclose(by_map, one_by_one, rtol=1e-4, atol=1e-6)
+    # Twenty lights, each with 16 taps.
+    sums = rounding(np.float32, operations=20 + 16, scale=one_by_one.max())
+    np.testing.assert_allclose(by_map, one_by_one, rtol=0, atol=sums)
     assert by_map.max() > 0.1
 
 

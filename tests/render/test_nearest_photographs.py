@@ -98,7 +98,9 @@ def test_what_the_nearest_does_not_see_comes_from_the_next(nearest):
     beyond = (normals @ around(140) > 0.995) & (normals @ around(60, 20) > 0.05)
     assert beyond.any()
     cosine = normals[beyond] @ around(60, 20)
-    assert carried.samples[beyond] == pytest.approx(cosine[:, None] * ALBEDO / np.pi, abs=0.02)
+    expected = cosine[:, None] * ALBEDO / np.pi
+    # A third of what neighbours differ by: observed .002.
+    assert carried.samples[beyond] == pytest.approx(expected, abs=0.006)
 
 
 def test_a_photograph_is_not_its_own_nearest(nearest, capture):
