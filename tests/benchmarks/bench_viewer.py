@@ -8,6 +8,8 @@ every machine and far slower than a graphics card; it says how two versions of t
 The difference is that of three images by the page and by the library, under one distant light:
 over all pixels inside the object, and over those that no edge of a shadow, of the object or of
 a part of it before another is near to (within 2 pixels): there the page has another resolution.
+Beside it is the difference of the library's image from one moved by 1/100 of a pixel: texels
+smaller than pixels are sampled, and rasterisers place vertices to 1/256 of a pixel only.
 Writes results/viewer.json.
 """
 
@@ -21,6 +23,7 @@ import statistics
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -56,6 +59,9 @@ RAYS = subpixel_offsets(16).tolist()
 # Pixels around edges; shares of the object's size by which one part lies before another, and by
 # which rays to the light start above the surface.
 EDGE_PX, DEPTH_JUMP, LIFT = 2, 0.02, 1e-4
+MOVED_PX = 0.01
+# Degrees above the horizon from which flat objects are looked at, and others.
+ABOVE_FLAT, ABOVE = 60, OrbitOptions().elevation_deg
 
 
 def fetches(stored):
@@ -105,10 +111,16 @@ def seen(scene, camera, light, offset):
 
 def differences(page, field):
     """Relative L2 differences from the library, of all pixels and of those off the edges."""
-    options = OrbitOptions(n_images=3, size=COMPARED_SIDE, up=tuple(field.up))
     stored = field.stored
+    is_flat = np.ptp(stored.positions, axis=0).min() == 0
+    options = OrbitOptions(
+        n_images=3,
+        size=COMPARED_SIDE,
+        up=tuple(field.up),
+        elevation_deg=ABOVE_FLAT if is_flat else ABOVE,
+    )
     scene = RayScene(Mesh(stored.positions, stored.faces))
-    off, wanted_all, kept = [], [], []
+    off, moved_off, wanted_all, kept = [], [], [], []
     for camera in orbit_cameras(stored.positions, options):
         light = rf.DirectionalLight(camera.up + 0.5 * np.cross(camera.up, camera.forward))
         wanted = field.render(camera, light, alpha=True)
@@ -119,13 +131,18 @@ def differences(page, field):
         shown = np.frombuffer(base64.b64decode(text), np.float32).reshape(wanted.shape)
         inside = ndimage.binary_erosion(wanted[..., 3] == 1, iterations=EDGE_PX)
         off.append((shown - wanted)[inside][:, :3])
+        moved = replace(camera, cx=camera.cx + MOVED_PX, cy=camera.cy + MOVED_PX)
+        moved_off.append((field.render(moved, light) - wanted[..., :3])[inside])
         wanted_all.append(wanted[inside][:, :3])
         kept.append(away_from_edges(scene, camera, light)[inside])
-    off, wanted, kept = map(np.concatenate, (off, wanted_all, kept))
+    off, moved_off, wanted, kept = map(np.concatenate, (off, moved_off, wanted_all, kept))
     return {
         "difference inside": float(np.linalg.norm(off) / np.linalg.norm(wanted)),
         "difference off the edges": float(
             np.linalg.norm(off[kept]) / np.linalg.norm(wanted[kept])
+        ),
+        "library moved by .01 pixels": float(
+            np.linalg.norm(moved_off) / np.linalg.norm(wanted)
         ),
         "share off the edges": float(kept.mean()),
         "median difference": float(np.median(np.abs(off)) / wanted.max()),
