@@ -395,7 +395,8 @@ def texel_taps(
     transition : float or (n,) float
         Width in texels, 0 to 1, over which neighbouring texels blend: 1 is bilinear, 0
         takes the nearest. Where texels are no larger than pixels the average over a pixel's
-        rays blends already, and bilinear taps would blur a second time.
+        rays blends already, and bilinear taps would blur a second time; see
+        `FieldSurface.transitions`.
 
     Returns
     -------

@@ -118,7 +118,8 @@ def _footprint_part(
     points = at[:, None, ::-1] + subpixel_offsets(RAYS_PER_PIXEL)
     hits = surface.first_hits(*surface.camera_rays(camera, points.reshape(-1, 2)))
     pixel = hits.ray // RAYS_PER_PIXEL
-    entries = surface.footprints(hits, pixel, surface.transitions(camera, hits))
+    transition = surface.transitions(camera, hits, RAYS_PER_PIXEL)
+    entries = surface.footprints(hits, pixel, transition)
     pixel, texel = entries.pixel, entries.texel
     weight = entries.summed(hits.front.astype(np.float32))
     covered = np.bincount(pixel, weight, minlength=len(at))

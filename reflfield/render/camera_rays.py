@@ -144,13 +144,18 @@ class FieldSurface:
         """Typical side of a texel on the surface, metres."""
         return float(np.sqrt(self.mesh.area / self.field.n_texels))
 
-    def transitions(self, camera: Camera, hits: SurfaceHits) -> Array:
-        """Width (n,) over which texels blend at each hit; see `texel_taps`."""
+    def transitions(self, camera: Camera, hits: SurfaceHits, rays_per_pixel: int) -> Array:
+        """Width (n,) over which texels blend at each hit; see `texel_taps`.
+
+        Blended over 1 - p, of pixels p texels wide, the mean over a pixel is bilinear; blended
+        over the cell of a ray, it is exact: each texel has the weight of its area.
+        """
         distance = np.ones(len(hits.ray))
         if camera.kind != ORTHOGRAPHIC:
             distance = np.linalg.norm(hits.position - camera.centre, axis=1)
         pixel_width = distance / max(camera.fl_x, camera.fl_y)
-        return np.clip(1.0 - pixel_width / self.texel_width, 0.0, 1.0)
+        ratio = pixel_width / self.texel_width
+        return np.clip(np.maximum(1.0 - ratio, ratio / rays_per_pixel**0.5), 0.0, 1.0)
 
     def footprints(
         self, hits: SurfaceHits, pixel: NDArray[np.int64], transition: ArrayLike = 1.0

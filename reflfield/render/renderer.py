@@ -278,7 +278,7 @@ class Renderer:
         hits = self.surface.first_hits(*rays)
         pixel = hits.ray // len(offsets)
         covered = np.bincount(pixel, minlength=len(row)) / len(offsets)
-        transition = self.surface.transitions(camera, hits)
+        transition = self.surface.transitions(camera, hits, len(offsets))
         entries = self.surface.footprints(hits, pixel, transition)
         total = np.zeros((len(groups), len(row), 3))
         for image, source in (

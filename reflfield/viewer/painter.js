@@ -149,8 +149,9 @@ class Painter {
     this.drawMesh();
   }
 
-  // Add the light of at most MOST_LAMPS lamps to an image that was begun.
-  addLamps(target, camera, clip, lamps, { show = 0, leastTransition = 0, isFirst = true }) {
+  // Add the light of at most MOST_LAMPS lamps to an image that was begun, one of so many that
+  // add up, each with another ray of every pixel.
+  addLamps(target, camera, clip, lamps, { show = 0, nRays = RAYS.length, isFirst = true }) {
     const { gl, header, surface } = this;
     for (const lamp of lamps) {
       lamp.casts = header.traced && !lamp.isAtEye;
@@ -171,7 +172,7 @@ class Painter {
     const scale = camera.parallel ? 1 : surface.radius;
     const focal = Math.max(...camera.focal) / (camera.parallel ? surface.radius : 1);
     gl.uniform1f(places.u_pixel, scale / focal / header.texel_width);
-    gl.uniform1f(places.u_least_transition, leastTransition);
+    gl.uniform1f(places.u_cell, 1 / Math.sqrt(nRays));
     gl.uniform1i(places.u_show, show);
     gl.uniform3fv(places.u_weight_scale, this.textures.weightScale);
     gl.uniform1f(places.u_alpha, isFirst ? 1 : 0);
@@ -267,7 +268,8 @@ class Painter {
       batchesOf(lamps).forEach((batch, i) => {
         const clip = clipFromWorld(camera, 0.5 - x, 0.5 - y);
         this.beginImage(target, clip);
-        this.addLamps(target, camera, clip, batch, { ...options, isFirst: i === 0 });
+        this.addLamps(target, camera, clip, batch,
+          { ...options, nRays: rays.length, isFirst: i === 0 });
         gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, read);
         for (let k = 0; k < read.length; k++) total[k] += read[k];
       });

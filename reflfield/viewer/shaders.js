@@ -211,7 +211,7 @@ uniform ivec2 u_atlas;
 uniform vec3 u_eye;
 uniform vec4 u_parallel;             // direction to the viewer and 1, of a parallel projection
 uniform float u_pixel;               // width of a pixel at distance 1 over that of a texel
-uniform float u_least_transition;
+uniform float u_cell;                // width of a ray's cell over that of a pixel
 uniform int u_show;
 uniform vec3 u_weight_scale;
 uniform int u_n_lamps;
@@ -322,7 +322,7 @@ void main() {
     return;
   }
   float pixel = u_pixel * (u_parallel.w == 1.0 ? 1.0 : distance);
-  find_taps(clamp(1.0 - pixel, u_least_transition, 1.0));
+  find_taps(clamp(max(1.0 - pixel, u_cell * pixel), 0.0, 1.0));
   vec3 total = vec3(0.0);
   if (u_show > 0) {
     total = shown_value(normal, view);

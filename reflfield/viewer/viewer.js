@@ -187,7 +187,7 @@ class Viewer {
     const clip = clipFromWorld(camera);
     painter.beginImage(painter.work, clip);
     if (this.field) {
-      const options = { show: SHOWS.indexOf(this.scene.show), leastTransition: 0.5 };
+      const options = { show: SHOWS.indexOf(this.scene.show), nRays: 1 };
       batchesOf(this.lampsFor(camera, this.mapLights.moving)).forEach((batch, i) => {
         if (i === 0 || options.show === 0) {
           painter.addLamps(painter.work, camera, clip, batch, { ...options, isFirst: i === 0 });

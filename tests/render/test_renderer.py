@@ -134,7 +134,8 @@ def test_pictures_agree_with_a_sum_over_samples(rng):
     points = origins - directions * (origins[:, 2] / directions[:, 2])[:, None]
     on_square = (np.abs(points[:, :2]) < 0.5).all(axis=1)
     pixel_width = np.linalg.norm(points - origins, axis=1) / 20.0
-    transition = np.clip(1 - pixel_width * np.sqrt(field.n_texels), 0, 1)
+    ratio = pixel_width * np.sqrt(field.n_texels)
+    transition = np.clip(np.maximum(1 - ratio, ratio / 3), 0, 1)
     texels, weights = texel_taps(field, points[:, :2] + 0.5, transition)
     values = sum(
         weights[:, [j]]
@@ -152,22 +153,42 @@ def test_pictures_agree_with_a_sum_over_samples(rng):
     assert expected.max() > 0.1
 
 
-def test_texels_as_large_as_pixels_are_not_blurred(rng):
-    """Seen from where it was photographed, every pixel shows its own texel."""
-    values = rng.random(64)
-    surface = square_surface(8)
+def checked_square(values):
+    """Field of a square whose texels have some values (n, n), row 0 at the top."""
+    n = len(values)
+    surface = square_surface(n)
     fitted = FittedReflectance(
         surface.base_from_world,
-        np.arange(64),
-        np.zeros((64, 0)),
-        values.reshape(64, 1, 1, 1) * np.ones((64, 1, 1, 3)),
-        np.zeros((64, 0, 1, 1, 3)),
+        np.arange(n * n),
+        np.zeros((n * n, 0)),
+        values.reshape(n * n, 1, 1, 1) * np.ones((n * n, 1, 1, 3)),
+        np.zeros((n * n, 0, 1, 1, 3)),
         domain="linear",
     )
-    field = build_field(surface, fitted)
-    image = render(field, overhead(8, 8.0), sun([0, 0, 1]), ONE_THREAD).image
+    return build_field(surface, fitted)
+
+
+def test_texels_as_large_as_pixels_are_not_blurred(rng):
+    """Seen from where it was photographed, every pixel shows its own texel."""
+    values = rng.random((8, 8))
+    image = render(checked_square(values), overhead(8, 8.0), sun([0, 0, 1]), ONE_THREAD).image
     # The means are stored in 16 bits.
-    assert np.allclose(image[..., 0], values.reshape(8, 8), atol=1e-4)
+    assert np.allclose(image[..., 0], values, atol=1e-4)
+
+
+@pytest.mark.parametrize("pixels_per_metre", [29.0, 17.3, 9.1])
+def test_smaller_texels_have_the_weights_of_their_areas(pixels_per_metre, rng):
+    """Pixels of 1.1, 1.9 and 3.5 texels, against the areas of texels in each."""
+    n, size = 32, 8
+    values = rng.random((n, n))
+    camera = overhead(size, pixels_per_metre)
+    image = render(checked_square(values), camera, sun([0, 0, 1]), ONE_THREAD).image
+    edges = n * (0.5 + (np.arange(size + 1) - size / 2) / pixels_per_metre)
+    low = np.maximum(edges[:-1, None], np.arange(n))
+    high = np.minimum(edges[1:, None], np.arange(1, n + 1))
+    shares = np.clip(high - low, 0, None) / np.diff(edges)[:, None]
+    # The means are stored in 16 bits.
+    assert np.allclose(image[..., 0], shares @ values @ shares.T, atol=1e-4)
 
 
 def test_texture_stands_upright():
