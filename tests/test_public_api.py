@@ -154,18 +154,20 @@ def square():
 
 
 class TestField:
-    def test_renders_lights_and_maps_and_their_sum(self, square):
+    def test_renders_lights_and_maps_and_their_sum(self, square, rounding):
         camera = rf.Camera.look_at([0, 0, 2], up=[0, 1, 0], width=33, height=33, fov_deg=20)
         lamp = rf.DirectionalLight([0, 0, 1], np.pi)
         sky = rf.EnvironmentMap(np.ones((8, 16, 3), np.float32))
         by_lamp, by_sky = square.render(camera, lamp), square.render(camera, environment=sky)
-        # Irradiance pi on a white surface, or radiance 1 from everywhere, comes back as 1. The
-        # grid of 9 x 9 nodes holds a constant to the step of quantisation, a hundredth; the
-        # sum over 512 lights with the softened cosine to a few more.
-        assert by_lamp[16, 16] == pytest.approx(1.0, abs=0.02)
-        assert by_sky[16, 16] == pytest.approx(1.0, abs=0.05)
+        # Irradiance pi on a white surface, or radiance 1 from everywhere, comes back as 1: the
+        # largest value has the largest code, which 16 taps hold in singles, cubed.
+        taps = rounding(np.float32, operations=16, condition=3)
+        assert by_lamp[16, 16] == pytest.approx(1.0, abs=taps)
+        # 512 lights, and the softened cosine: observed .005.
+        assert by_sky[16, 16] == pytest.approx(1.0, abs=0.01)
         both = square.render(camera, [lamp], environment=sky)
-        np.testing.assert_allclose(both, by_lamp + by_sky, rtol=1e-5)
+        sums = rounding(np.float32, operations=3)
+        np.testing.assert_allclose(both, by_lamp + by_sky, rtol=sums)
 
     def test_alpha_is_the_share_that_is_covered(self, square):
         camera = rf.Camera.look_at([0, 0, 2], up=[0, 1, 0], width=32, height=32, fov_deg=60)
@@ -195,7 +197,7 @@ class TestField:
         )
         assert one == pytest.approx(0.8 / np.pi, abs=0.01)  # quantisation
 
-    def test_parts_belong_together(self):
+    def test_parts_belong_together(self, rounding):
         field = rf.Field(baked_field(sphere_surface(8), lambert(0.5)))
         assert isinstance(field.mesh, trimesh.Trimesh)
         assert field.mesh.visual.uv.shape == (len(field.mesh.vertices), 2)
@@ -206,7 +208,7 @@ class TestField:
         # On the unit sphere a texel's normal is where it is, to half a texel along each side.
         tilt = field.normals[5] @ arrays["positions"][nearest]
         assert tilt > np.cos(np.pi / 8)
-        np.testing.assert_allclose(np.sum(field.normals * field.tangents, 1), 0, atol=1e-6)
+        assert np.abs(np.sum(field.normals * field.tangents, 1)).max() < rounding(np.float32)
         assert arrays["mean"].shape[1:3] == (
             len(arrays["view_nodes"]), len(arrays["light_nodes"]),
         )  # fmt: skip

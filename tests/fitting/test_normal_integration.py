@@ -60,18 +60,14 @@ def test_the_surface_stays_inside_of_the_hull():
 def test_normals_of_the_hull_move_nothing():
     positions, up, graph = plane()
     fitted = FittedNormals(positions, up, up, np.ones(len(up)))
-    np.testing.assert_allclose(
-        integrated_displacements(fitted, graph, np.zeros(len(up))), 0, atol=1e-9
-    )
+    assert not integrated_displacements(fitted, graph, np.zeros(len(up))).any()
 
 
 def test_normals_that_nothing_determines_move_nothing():
     positions, up, graph = plane()
     _, normals = bumps(positions)
     fitted = FittedNormals(positions, up, normals, np.zeros(len(up)))
-    np.testing.assert_allclose(
-        integrated_displacements(fitted, graph, np.zeros(len(up))), 0, atol=1e-9
-    )
+    assert not integrated_displacements(fitted, graph, np.zeros(len(up))).any()
 
 
 def test_anchors_hold_the_surface_to_the_hull():
@@ -116,7 +112,7 @@ def test_anchors_stand_where_an_outline_touches_a_rim():
     distances = [signed_distance(coverage), None]
     anchors = silhouette_anchors([camera, camera], distances, points, normals)
     assert anchors[0] > 0.9
-    assert anchors[1] < 1e-6
+    assert anchors[1] < 1e-100  # exp(-(1 / .05)^2), of a cosine of 1
     assert anchors[2] == 0
 
 

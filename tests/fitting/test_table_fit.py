@@ -145,12 +145,13 @@ def test_tables_reach_what_saturated_values_are_known_to_reach(small_rng):
     assert darker[True] < 0.3 * darker[False]
 
 
-def test_the_normal_form_changes_no_sample(small_rng):
+def test_the_normal_form_changes_no_sample(small_rng, rounding):
     model = random_model(small_rng)
     rows = random_rows(small_rng, model, 50)
     normalised = normalised_tables(model)
-    assert normalised.diffuse_table.mean() == pytest.approx(1, rel=1e-6)
-    assert np.mean(normalised.weights**2, axis=0) == pytest.approx(np.ones(2), rel=1e-6)
+    singles = rounding(np.float32)
+    assert normalised.diffuse_table.mean() == pytest.approx(1, rel=singles)
+    assert np.mean(normalised.weights**2, axis=0) == pytest.approx(np.ones(2), rel=singles)
     # Two roundings of singles more.
     np.testing.assert_allclose(shown(normalised, rows), rows.values, rtol=1e-5)
 
@@ -215,11 +216,12 @@ def test_planted_skews_are_recovered(small_rng, monkeypatch):
     assert errors[-1] < 0.05 * errors[0]
     # Nodes that rows are about: neither near the axis nor where lights graze.
     skew = begin.skews[0].reshape(N_DIFFERENCE, SKEW_RINGS, 3)[1:4, 2:5]
-    np.testing.assert_allclose(skew, np.broadcast_to([-0.6, 0.0, 0.3], skew.shape), atol=0.05)
+    # What the rows leave open, the ties between nodes fill: observed .011.
+    np.testing.assert_allclose(skew, np.broadcast_to([-0.6, 0.0, 0.3], skew.shape), atol=0.03)
     assert not begin.skews[:, ~FREE_SKEWS].any()
 
 
-def test_the_equations_of_skews_are_those_of_a_dense_least_squares(small_rng):
+def test_the_equations_of_skews_are_those_of_a_dense_least_squares(small_rng, rounding):
     model = random_model(small_rng, n=6)
     rows = random_rows(small_rng, replace(model, diffuse=model.diffuse * 1.1), 300)
     n = model.n_lobes * SKEW_NODES
@@ -242,9 +244,11 @@ def test_the_equations_of_skews_are_those_of_a_dense_least_squares(small_rng):
         matrix = a.T @ (w[:, None] * a) + prior[np.ix_(free, free)]
         right = a.T @ (w * (rows.values - at_zero)[:, c])
         exact = np.clip(np.linalg.solve(matrix, right), -0.95, 0.95)
-        # Differences of singles make the columns here, over a system of condition 1e4 or less.
-        assert np.linalg.cond(matrix) < 1e4
-        np.testing.assert_allclose(solved.reshape(n, 3)[free, c], exact, atol=5e-3)
+        condition = np.linalg.cond(matrix)
+        assert condition < 1e4
+        # Differences of singles make the columns here.
+        tolerance = rounding(np.float32, condition=condition)
+        np.testing.assert_allclose(solved.reshape(n, 3)[free, c], exact, rtol=0, atol=tolerance)
 
 
 def test_a_narrow_highlight_does_not_lift_the_dark(small_rng):
@@ -264,7 +268,7 @@ def test_a_narrow_highlight_does_not_lift_the_dark(small_rng):
     with ThreadPoolExecutor(2) as pool:
         for _ in range(4):
             begin = fit_tables(rows, begin, pool)
-    dark = rows.values.mean(axis=1) < 1e-3
+    dark = rows.values.mean(axis=1) < 1e-3  # ten times the floor of the peak
     assert dark.mean() > 0.3
     lifted = shown(begin, rows)[dark].mean() / rows.values[dark].mean()
     assert lifted < 2.0

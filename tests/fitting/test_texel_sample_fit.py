@@ -81,9 +81,9 @@ def test_planted_coefficients_are_found(small_rng):
     with ThreadPoolExecutor(2) as pool:
         for _ in range(3):
             begin, _ = solve_coefficients(blocks_of(block), begin, pool, tie=1e-9)
-    # The factor 1.0001 on the diagonal, times the condition of two random lobes.
-    np.testing.assert_allclose(begin.diffuse, truth.diffuse, atol=0.02)
-    np.testing.assert_allclose(begin.weights, truth.weights, atol=0.05)
+    # The factor 1.0001 on the diagonal, times the condition of two random lobes: observed 9.
+    np.testing.assert_allclose(begin.diffuse, truth.diffuse, atol=50 * 1e-4)
+    np.testing.assert_allclose(begin.weights, truth.weights, atol=50 * 1e-4)  # the same
 
 
 def test_coefficients_are_never_negative(small_rng):
@@ -105,7 +105,8 @@ def test_texels_without_samples_get_the_usual_coefficients(small_rng):
     with ThreadPoolExecutor(1) as pool:
         fit, _ = solve_coefficients(blocks_of(block), model, pool)
         colored = with_start_colors(blocks_of(block), model, pool)
-    np.testing.assert_allclose(fit.diffuse[2], model.diffuse.mean(axis=0), rtol=1e-3)
+    # The factor 1.0001 on the diagonal.
+    np.testing.assert_allclose(fit.diffuse[2], model.diffuse.mean(axis=0), rtol=1.5e-4)
     assert np.isfinite(colored.diffuse).all()
 
 
@@ -146,7 +147,7 @@ def test_tangents_turn_to_the_long_axis_of_highlights(small_rng):
         )
     off = np.degrees(np.arccos(np.clip(np.abs(turned_back.frames[:, 0, 0]), 0, 1)))
     assert np.median(off) < 5
-    np.testing.assert_allclose(turned_back.frames[:, 2], turned[:, 2], atol=1e-6)
+    np.testing.assert_array_equal(turned_back.frames[:, 2], turned[:, 2])
 
 
 def test_blocks_beyond_the_budget_are_read_again(small_rng):

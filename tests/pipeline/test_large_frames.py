@@ -41,6 +41,6 @@ def test_large_frames_keep_below_the_ceiling_that_is_asked_for(
     assert run(f"{asked[1]}GB").status == 0
     timings = json.loads((tmp_path / "out" / "timings.json").read_text())
     ceiling = float(asked[1]) * 2**30
-    assert timings["max_memory"] == pytest.approx(ceiling, rel=1e-6)
+    assert timings["max_memory"] == pytest.approx(ceiling, abs=1)  # whole bytes
     # The libraries alone take 400 MB, so that the watch has seen something.
     assert 400e6 < timings["peak_bytes"] <= ceiling

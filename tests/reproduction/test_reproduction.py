@@ -135,7 +135,7 @@ def perfect():
     return Recovered(SIZE[::-1], truth, frames)
 
 
-def test_true_frames_leave_one_component_and_no_error():
+def test_true_frames_leave_one_component_and_no_error(rounding):
     table = figure_5(perfect()).items[1]
     by_name = {row[0]: row[1:] for row in table.rows}
     assert by_name["the paper's"][1] == 20
@@ -143,30 +143,36 @@ def test_true_frames_leave_one_component_and_no_error():
     assert by_name[REFINED][0] < 1e-9
     assert by_name[REFINED][1] > 20
     errors = {row[0]: row[1:] for row in figure_6(perfect()).items[1].rows}
-    assert max(errors[REFINED]) < 1e-5
+    # The arc cosine of numbers near 1 keeps half the digits.
+    assert max(errors[REFINED]) < np.degrees(np.sqrt(rounding(float)))
 
 
-def test_components_are_counted_by_the_energy_that_they_leave():
+def test_components_are_counted_by_the_energy_that_they_leave(rounding):
     unaligned, aligned = np.array([4.0, 3.0, 2.0, 1.0]), np.array([5.0, 2.0, 1.0, 0.0])
     # 30 and 30 in all; aligned leaves 1/30 after two, unaligned 5, then 1.
     np.testing.assert_allclose(energy_left(unaligned)[1:3], [5 / 30, 1 / 30])
     assert equal_components(unaligned, aligned) == 3
     matrix = np.random.default_rng(1).standard_normal((6, 30))
     expected = np.linalg.svd(matrix, compute_uv=False)
-    np.testing.assert_allclose(singular_values(matrix), expected, rtol=1e-10)
+    # Roots of the eigenvalues of a product of 30 columns.
+    condition = (expected[0] / expected[-1]) ** 2
+    tolerance = rounding(float, operations=30, condition=condition)
+    np.testing.assert_allclose(singular_values(matrix), expected, rtol=tolerance)
 
 
-def test_alignment_with_true_frames_keeps_the_picture_that_compression_alone_loses():
+def test_alignment_with_true_frames_keeps_the_picture_that_compression_alone_loses(rounding):
     texture = texture_figures.simulated_texture(*SIZE)
     assert texture.samples.shape == (80, 151, 151)
     frames = {UNALIGNED: np.tile(np.eye(3), (80, 1, 1)), REFINED: texture.truth}
     table = texture_figures.figure_8(texture, frames).items[1]
     errors = {row[0]: row[1:] for row in table.rows}
-    assert errors[REFINED][0] < 1e-3 < 0.1 < errors[UNALIGNED][0]
+    singles = rounding(np.float32)  # as few components as the picture has
+    assert errors[REFINED][0] < singles
+    assert errors[UNALIGNED][0] > 0.1
     # What is left of the picture is the interpolation between 13 x 13 nodes.
     assert errors[REFINED][1] < 0.5 * errors[UNALIGNED][1]
     curves = texture_figures.figure_7(texture, frames).items[1].rows
-    assert curves[1][1] < 1e-3 < curves[0][1]
+    assert curves[1][1] < singles < 1e-3 < curves[0][1]
 
 
 def test_maxima_on_the_papers_grid_lie_beside_the_frames(monkeypatch):
@@ -211,12 +217,13 @@ def write_felt(folder, reflectance):
     return d
 
 
-def test_a_felt_is_read_and_is_exact_at_the_measured_directions(tmp_path):
+def test_a_felt_is_read_and_is_exact_at_the_measured_directions(tmp_path, rounding):
     d = dome_directions(RINGS_151)
     reflectance = 0.2 + 0.1 * np.exp(d @ [0.3, 0.1, 0.5])[:, None] * np.exp(d[:, 0])
     write_felt(tmp_path, reflectance)
     directions, values = read_felt(tmp_path)
-    np.testing.assert_allclose(values, reflectance, rtol=1e-10)
+    # A third of a logarithm, of size 1 or so, and the cube of its power.
+    np.testing.assert_allclose(values, reflectance, rtol=rounding(float, operations=3))
     felt = Felt(directions, values)
     at = felt.samples(directions[None, :7], directions[None, 20:30])[0]
     # Splines through the data, stored in float32.

@@ -44,7 +44,11 @@ def test_map_is_equal_area(rng):
 
 @given(st.integers(1, 40))
 def test_solid_angles_sum_to_hemisphere(side):
-    assert np.isclose(HemisphereGrid(side).solid_angles.sum(), 2 * np.pi, rtol=1e-13)
+    # Roundings of side^2 additions wander as the root of their number.
+    tolerance = 8 * np.finfo(float).eps * side
+    np.testing.assert_allclose(
+        HemisphereGrid(side).solid_angles.sum(), 2 * np.pi, rtol=tolerance
+    )
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 9, 25])

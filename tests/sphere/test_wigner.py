@@ -165,13 +165,13 @@ def test_product_of_rotations_is_product_of_matrices(rounding):
         np.testing.assert_allclose(product, c[part].reshape(shape), atol=rounding(float, 30))
 
 
-def test_rotation_about_z_mixes_only_equal_orders():
+def test_rotation_about_z_mixes_only_equal_orders(rounding):
     block = rotation_blocks(Rotation.from_rotvec([[0, 0, 0.4]]).as_matrix(), 3)[
         0, 10:35
     ].reshape(5, 5)
     m = np.abs(np.arange(-2, 3))
     assert np.abs(block[m[:, None] != m[None, :]]).max() == 0.0
-    assert block[4, 4] == pytest.approx(np.cos(0.8), abs=1e-15)
+    assert block[4, 4] == pytest.approx(np.cos(0.8), abs=rounding(float))
 
 
 def test_wrong_shapes_are_refused():
