@@ -63,7 +63,7 @@ def test_angles_of_a_leaning_pile_are_found(scene, rng):
     assert alignment.margin.max() > 0.0
 
 
-def test_isotropic_reflectance_keeps_the_angle_of_the_base_frame(scene, rng):
+def test_isotropic_reflectance_keeps_the_angle_of_the_base_frame(scene, rng, rounding):
     d = scene.dome_directions()
     truth = frames_of_any_angle(rng, 60, 45.0)
     samples = leaning(np.einsum("nij,kj->nki", truth, d), 0.0)
@@ -71,7 +71,8 @@ def test_isotropic_reflectance_keeps_the_angle_of_the_base_frame(scene, rng):
     assert alignment.symmetries == ("all",)
     frames = alignment.local_from_base
     # The turn nearest to the base frame leaves no antisymmetric part in the tangent plane.
-    assert np.abs(frames[:, 0, 1] - frames[:, 1, 0]).max() < 1e-6
+    left = np.abs(frames[:, 0, 1] - frames[:, 1, 0]).max()
+    assert left < rounding(float, operations=9)  # products of matrices
 
 
 @pytest.fixture
