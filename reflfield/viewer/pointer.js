@@ -108,15 +108,17 @@ class LampHandles {
   // Middle and radius of the sphere in pixels of the window.
   sphere(camera) {
     const middle = camera.rows.map((row) => -dot(row, camera.eye));
-    const { canvas } = this.viewer, ratio = canvas.clientWidth / camera.width;
+    const { canvas } = this.viewer;
+    // Coarse images have whole pixels: the ratios differ.
+    const ratios = [canvas.clientWidth / camera.width, canvas.clientHeight / camera.height];
     const depth = Math.max(middle[2], 0.1);
     const [left, top, width, height] = this.viewer.free(canvas.clientWidth, canvas.clientHeight);
     const place = (axis, from, size) => clamp(
-      (camera.centre[axis] + camera.focal[axis] * middle[axis] / depth) * ratio, from, from + size);
+      (camera.centre[axis] + camera.focal[axis] * middle[axis] / depth) * ratios[axis], from, from + size);
     return {
       x: place(0, left, width), y: place(1, top, height),
       // Where the object is larger than the window, the dots stay in it.
-      radius: clamp(1.05 * camera.focal[0] / depth * ratio, 60, 0.43 * Math.min(width, height)),
+      radius: clamp(1.05 * camera.focal[0] / depth * ratios[0], 60, 0.43 * Math.min(width, height)),
     };
   }
 

@@ -30,11 +30,15 @@ function noteBriefly(text) {
   setTimeout(() => panel.show(), 4000);
 }
 
-// The free part of the window, beside or above the panel.
+// The free part of the window, beside or above the panel; below the title where both would meet.
+let titleHeight = 0;  // its greatest: a line that goes away moves nothing
 function freePart(width, height) {
-  const box = element("panel").getBoundingClientRect();
-  if (!box.width) return [0, 0, width, height];
-  return box.width < width - 60 ? [0, 0, box.left, height] : [0, 0, width, box.top];
+  const box = element("panel").getBoundingClientRect(), isBeside = box.width < width - 60;
+  const right = box.width && isBeside ? box.left : width;
+  const bottom = box.width && !isBeside ? box.top : height;
+  titleHeight = Math.max(titleHeight, document.querySelector("header").getBoundingClientRect().bottom);
+  const top = right < 700 ? Math.min(titleHeight, 0.15 * bottom) : 0;
+  return [0, top, right, bottom - top];
 }
 
 const act = {

@@ -92,7 +92,7 @@ def test_a_light_follows_a_finger(page, touch):
     before = page.evaluate("reflfield.viewer().scene")
     after = touch([(x, y)], [(x - 15, y + 20)], [(x - 30, y + 30)])
     moved = dot.bounding_box()
-    assert moved["x"] + moved["width"] / 2 == pytest.approx(x - 30, abs=3)  # pixels
-    assert moved["y"] + moved["height"] / 2 == pytest.approx(y + 30, abs=3)
+    assert moved["x"] + moved["width"] / 2 == pytest.approx(x - 30, abs=1)  # whole pixels
+    assert moved["y"] + moved["height"] / 2 == pytest.approx(y + 30, abs=1)  # whole pixels
     assert after["lamps"][0] != before["lamps"][0]
     assert after["camera"] == before["camera"]
