@@ -60,6 +60,6 @@ def test_every_literal_tolerance_has_its_reason_beside_it():
 def test_what_counts_as_a_reason():
     assert without_reason("assert x == approx(1, abs=1e-6)\n") == [1]
     assert without_reason("assert abs(x) < 1e-6\n") == [1]
-    assert without_reason("# written with six decimals\nassert x == approx(1, abs=1e-6)\n") == []
+    assert without_reason("# six decimals\nassert x == approx(1, abs=1e-6)\n") == []
     assert without_reason("assert abs(x) < 1e-6  # float32\n") == []
     assert without_reason("assert x == approx(1, abs=8 * rounding)\nassert y < 0.5\n") == []
