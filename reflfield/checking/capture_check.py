@@ -277,8 +277,13 @@ def _without_lights(by_fit: PhotographFits, lights: set[int]) -> PhotographFits:
 
 
 def _dark(shading: Shading) -> frozenset[int]:
-    """Photographs that are far darker than expected: noise says nothing of their place."""
-    rows = np.flatnonzero(shading.gains < np.log(DARK))
+    """Photographs of which little but noise is seen, which says nothing of their place.
+
+    Those are far darker than expected, and nowhere bright: a photograph that shows another
+    side than it should is dark where light is expected, but bright elsewhere.
+    """
+    darkest = np.nanmedian(shading.peaks) + np.log(DARK)
+    rows = np.flatnonzero((shading.gains < np.log(DARK)) & ~(shading.peaks > darkest))
     return frozenset(int(shading.photographs[row]) for row in rows)
 
 

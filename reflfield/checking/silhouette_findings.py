@@ -230,31 +230,37 @@ def _is_certain(view: CheckedView, edges: dict[int, MaskEdge]) -> bool:
 
 def _nothing_common(views: Sequence[CheckedView]) -> Finding:
     why = explain_all([v.camera for v in views], [v.coverage for v in views], 0.0)
-    return _together(why, "the silhouettes bound no common body")
+    return _together(views, why, "the silhouettes bound no common body")
 
 
 def _all_contradict(views: Sequence[CheckedView], verdict: Verdict, fit: float) -> Finding:
     covered = 1 - float(np.median(verdict.uncovered))
     n = int((verdict.uncovered > np.median(verdict.uncovered) / 2).sum())
+    words = (
+        f"{n} of {len(views)} outlines are excluded in parts by other views, no few to blame"
+    )
     if _all_made(views) and fit > MADE_OVERLAP:
-        return Finding(
-            "masks made from photographs",
-            WARNING,
-            (),
-            f"{n} of {len(views)} are excluded in parts by others, as where the object is as "
-            "dark as the backdrop; the hull that most of them allow agrees with them to "
-            f"{100 * fit:.0f} % (median, intersection over union)",
-            "give masks, or make better ones with `reflfield masks`; if these look right, "
-            "check the calibration",
-        )
+        hull = f"the hull that most allow agrees with them to {100 * fit:.0f} % (median)"
+        return _poor_masks(WARNING, f"{words}; {hull}")
     why = explain_all([v.camera for v in views], [v.coverage for v in views], covered)
-    return _together(
-        why,
-        f"{n} of {len(views)} outlines are excluded in parts by other views, no few to blame",
+    return _together(views, why, words)
+
+
+def _poor_masks(severity: str, words: str) -> Finding:
+    """Finding on masks of which nobody but this program says that they are right."""
+    return Finding(
+        "masks made from photographs",
+        severity,
+        (),
+        f"{words}; so it is where the object is as dark as the backdrop, or this is uneven",
+        "give masks, or make better ones with `reflfield masks`; if these look right, check "
+        "the calibration (poses, focal lengths, distortion)",
     )
 
 
-def _together(why: Explanation | None, words: str) -> Finding:
+def _together(views: Sequence[CheckedView], why: Explanation | None, words: str) -> Finding:
+    if why is None and _all_made(views):
+        return _poor_masks(ERROR, words)
     if why is None:
         return Finding(
             "contradicting silhouettes",

@@ -111,6 +111,16 @@ def test_a_swap_between_views_of_a_dark_underside_is_named(planted, check_folder
     assert named(check_folder(planted.folder), "swapped photographs") == names
 
 
+def test_a_turned_photograph_that_is_dark_where_light_is_expected_is_named(
+    planted, check_folder
+):
+    """Lit from the side, it is all but black where it should be bright, and the reverse."""
+    planted.change_photograph(17, 8, lambda image: np.rot90(image, 2))
+    findings = check_folder(planted.folder)
+    assert named(findings, "turned photograph") == {planted.photograph(17, 8).stem}
+    assert grave(findings) == {"turned photograph"}
+
+
 def test_a_swapped_photograph_that_repeats_pixels_is_no_other_fault(planted, check_folder):
     """From two sides of the amphora the same pixels are right: of v015 under l006, too."""
     f.swap_files(planted.photograph(17, 12), planted.photograph(15, 6))

@@ -61,19 +61,31 @@ def without_a_dark_part(silhouette, rng):
     return lost
 
 
+def checked(cameras, masks, origin):
+    cones = measured_views(cameras, masks)
+    return [
+        CheckedView(i, cone.camera, mask.astype(np.float32), origin, cone)
+        for i, (cone, mask) in enumerate(zip(cones, masks, strict=True))
+    ]
+
+
 @pytest.mark.parametrize(
     ("origin", "severity"), [("photographs", "warning"), ("file", "error")]
 )
 def test_masks_that_miss_dark_parts_are_doubted_before_the_cameras(rig, rng, origin, severity):
     cameras, silhouettes = rig
     masks = [without_a_dark_part(silhouette, rng) for silhouette in silhouettes]
-    cones = measured_views(cameras, masks)
-    views = [
-        CheckedView(i, cone.camera, mask.astype(np.float32), origin, cone)
-        for i, (cone, mask) in enumerate(zip(cones, masks, strict=True))
-    ]
-    (finding, *_), shape = contradiction_findings(None, views, {})
+    (finding, *_), shape = contradiction_findings(None, checked(cameras, masks, origin), {})
     assert finding.severity == severity
     assert ("made from photographs" in finding.kind) == (origin == "photographs")
     if origin == "photographs":
         assert shape.mesh is not None
+
+
+def test_made_masks_that_have_nothing_in_common_are_an_error_of_the_masks_first(rig, rng):
+    cameras, silhouettes = (items[:20] for items in rig)
+    masks = [
+        np.roll(s, rng.integers(-14, 15, 2), axis=(0, 1)).astype(s.dtype) for s in silhouettes
+    ]
+    (finding, *_), _ = contradiction_findings(None, checked(cameras, masks, "photographs"), {})
+    assert (finding.kind, finding.severity) == ("masks made from photographs", "error")
