@@ -487,10 +487,14 @@ def test_bad_matrices_are_refused():
 
 @pytest.mark.stability
 def test_columns_that_are_all_sparse_shape_the_basis_together(rng):
-    """Of each one in a hundred entries: no column reaches the usual share."""
-    truth = rng.standard_normal((1000, 2)) @ rng.standard_normal((2, 600)) + 3.0
-    observed = rng.random(truth.shape) < 0.012
-    fit = complete(truth, observed, rank=3, passes=4, seed=0)
-    assert fit.sparse_columns.mean() < 0.2
-    error = (reconstructed(fit, np.arange(600)) - truth)[observed]
-    assert np.sqrt(np.mean(error**2)) < 0.3 * np.sqrt(np.mean(truth**2))
+    """Of each 18 of 1,200 entries, 1.5 %: no column reaches the usual share."""
+    n = 1200
+    truth = rng.standard_normal((n, 1)) @ rng.standard_normal((1, n)) + 3.0
+    # Of as many rows some have samples that hardly tell their two unknowns apart: four passes
+    # do not find these, so that most entries speak for the basis.
+    observed = rng.random(truth.shape).argsort(axis=0) < 18
+    fit = complete(truth, observed, rank=2, passes=4, seed=0)
+    assert not fit.sparse_columns.any()
+    error = np.median(np.abs(reconstructed(fit) - truth))
+    # Nothing here is noise; the mean alone would leave the deviation.
+    assert error < 0.1 * np.median(np.abs(truth - 3.0))
