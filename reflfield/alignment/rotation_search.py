@@ -32,6 +32,9 @@ BLOCK = 256
 N_PEAKS = 8
 # Targets whose coarse peak is among the best few are searched with all degrees.
 N_FINALISTS = 3
+# Scores are at most 1 and rounded in float32: of targets that are alike but for this the first
+# is taken, so that functions that are alike are of one cluster.
+SAME_SCORE = 8.0 * float(np.finfo(np.float32).eps)
 # Of a target that a half turn changes by less than this share of its energy, one of two
 # candidates that differ by a half turn tells of both.
 SYMMETRIC_SHARE = 1e-3
@@ -274,7 +277,7 @@ def _keep_better(
     maxima = Maxima(np.zeros((n, 3, 3)), np.zeros((n, 11)), np.zeros(n))
     ascend_best(series, candidates, rules, maxima)
     top, at_top = maxima.rotations, maxima.derivatives
-    better = at_top[:, 0] > best.score[who]
+    better = at_top[:, 0] > best.score[who] + SAME_SCORE
     best.rotations[who[better]] = top[better]
     best.score[who[better]] = at_top[better, 0]
     best.cluster[who[better]] = k

@@ -204,7 +204,9 @@ def test_duplicates_of_one_texel_stay_together(refine, scene, rng):
     alignment = align(np.tile(samples, (12, 1, 1)), d, d, n_clusters=4, refine=refine)
     assert len(np.unique(alignment.cluster)) == 1
     spread = np.ptp(alignment.local_from_base, axis=0).max()
-    assert spread < 1e-6  # one texel, one answer; sums of float32 may be ordered differently
+    # One texel, one answer. Sums of float32 may be ordered differently, and a score is lower by
+    # the square of the angle to its maximum.
+    assert spread < np.sqrt(np.finfo(np.float32).eps)
 
 
 @pytest.mark.stability

@@ -272,3 +272,11 @@ def test_bad_arguments_are_refused(rng):
         search(a, a[:1], max_tilt=4.0)
     with pytest.raises(ShapeError, match="start"):
         search(a, a[:1], start=np.eye(3))
+
+
+def test_of_targets_that_are_alike_the_first_is_taken(rng):
+    """Turned copies correlate as well as each other, but for roundings."""
+    target = couple(lobes(rng, 1, 6, np.float32))
+    truth = Rotation.random(43, random_state=rng).as_matrix()
+    copies = turned_copies(target, truth)
+    assert not search(copies[3:], copies[:3]).cluster.any()
