@@ -13,6 +13,7 @@ from reflfield.alignment.in_plane_rotation import (
     angle_margin,
     at_best_angles,
     distances_by_angle,
+    find_angles,
 )
 from reflfield.alignment.refinement import SharpAlignment
 from reflfield.alignment.spline_targets import SplineTargets
@@ -75,6 +76,17 @@ def test_isotropic_reflectance_keeps_the_angle_of_the_base_frame(scene, rng, rou
     assert left < rounding(float, operations=9)  # products of matrices
 
 
+def test_isotropic_reflectance_about_an_axis_that_is_not_z_has_no_angle(scene, rng):
+    """Rotations about z tilt its texels; those fit again as soon as normals are improved."""
+    d = scene.dome_directions()
+    truth = frames_of_any_angle(rng, 60, 45.0)
+    data = SampleSet(leaning(np.einsum("nij,kj->nki", truth, d), 0.0), d, d)
+    off = Rotation.from_rotvec([np.deg2rad(10.0), 0.0, 0.0]).as_matrix() @ truth
+    empty = SplineTargets.zeros(1, (len(d), len(d)), QUICK.side)
+    state = SharpAlignment.begin(data, off, np.zeros(60, np.int32), empty)
+    assert not find_angles(data, state, QUICK, 2)[1]
+
+
 @pytest.fixture
 def known_state(scene, rng):
     """Twenty upright texels of a leaning pile, each turned by a multiple of 15 degrees."""
@@ -125,16 +137,17 @@ def test_normal_is_found_when_angles_follow_the_tilts(scene, rng):
     assert np.rad2deg(lean).max() < 8.0
 
 
-def test_mean_normal_is_taken_when_angles_are_random(scene, rng):
-    """The pile leans the mean light; random turns leave the mean normal its chance error."""
+def test_mean_normal_is_taken_when_angles_are_random(scene, rng, rounding):
+    """The pile leans the mean light; frames of which every tilt comes turned to four sides."""
     d = scene.dome_directions()
     target = couple(Projector(d, d, (6, 6)).project(leaning(d[None], 0.2))).units()
-    azimuth, turn = rng.uniform(0, 2 * np.pi, (2, 500))
-    tilt = rng.uniform(0, np.pi / 3, 500)
-    angles = np.stack([azimuth, tilt, turn], axis=1)
+    azimuth, turn = rng.uniform(0, 2 * np.pi, (2, 60))
+    angles = np.stack([azimuth, rng.uniform(0, np.pi / 3, 60), turn], axis=1).repeat(4, axis=0)
+    angles[:, 2] += np.tile(np.arange(4) * np.pi / 2, 60)
     base_from_local = Rotation.from_euler("ZYZ", angles).as_matrix()
-    resolved = resolve_ambiguity(target, base_from_local, np.zeros(500, np.int32), np.ones(500))
-    lean = np.arccos(np.sum(resolved.rotations[:, :, 2] * base_from_local[:, :, 2], axis=1))
-    chance = np.arctan(np.linalg.norm(base_from_local[:, 2, :2].mean(axis=0)))
-    # Tilts are at most sixty degrees: the mean of the normals is longer than a half.
-    np.testing.assert_array_less(lean, 2.0 * chance)
+    resolved = resolve_ambiguity(target, base_from_local, np.zeros(240, np.int32), np.ones(240))
+    # By four sides the mean normal is the normal; the light leans by .077, and the chance error
+    # of so few, .025, does not tell it from that.
+    lean = np.linalg.norm(resolved.rotations[:, :, 2] - base_from_local[:, :, 2], axis=1)
+    # Targets are in single precision, whose light the mean normal is written down from.
+    assert lean.max() < rounding(np.float32)
