@@ -352,7 +352,9 @@ def test_mitsuba_reads_the_map_the_same_way(rng):
     interaction = mitsuba.SurfaceInteraction3f()
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    directions[100:, 1] *= 0.05  # a band around the horizon
+    # A band of three degrees to both sides of the horizon, however high they were.
+    level = np.linalg.norm(directions[100:, ::2], axis=1)
+    directions[100:, 1] *= 0.05 * level
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
 
     def seen(direction):
@@ -361,7 +363,8 @@ def test_mitsuba_reads_the_map_the_same_way(rng):
 
     error = np.abs([seen(d) for d in directions] - (2 + directions @ slopes))
     # Mitsuba 3.9 puts the first and last rows' centres on the poles, half a row off ours
-    # (pi / 64 times the slope, 0.065); on the horizon only interpolation is left.
+    # (pi / 64 times the slope, 0.065); of that a thirtieth is left three degrees from the
+    # horizon, .002, and as much of the interpolation over pi / 32.
     assert error[:100].max() < 0.065
     assert error[100:].max() < 0.006
 
