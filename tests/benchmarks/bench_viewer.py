@@ -112,11 +112,12 @@ def seen(scene, camera, light, offset):
 def differences(page, field):
     """Relative L2 differences from the library, of all pixels and of those off the edges."""
     stored = field.stored
-    is_flat = np.ptp(stored.positions, axis=0).min() == 0
+    sides = np.ptp(stored.positions, axis=0)
+    is_flat = sides.min() == 0
     options = OrbitOptions(
         n_images=3,
         size=COMPARED_SIDE,
-        up=tuple(field.up),
+        up=tuple(np.eye(3)[sides.argmin()] if is_flat else field.up),
         elevation_deg=ABOVE_FLAT if is_flat else ABOVE,
     )
     scene = RayScene(Mesh(stored.positions, stored.faces))
