@@ -78,7 +78,7 @@ CAPTURES = {
         folder="middlebury_sparse_rings/dinoSparseRing",
     ),
     "mia_guanyu_flash": Benchmark(
-        "240, each with a view and a light of its own",
+        "240, by flash",
         "8 photographs",
         (
             *("--hold-out", "photographs=8", "--encoding"),
