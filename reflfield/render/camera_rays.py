@@ -147,8 +147,9 @@ class FieldSurface:
     def transitions(self, camera: Camera, hits: SurfaceHits, rays_per_pixel: int) -> Array:
         """Width (n,) over which texels blend at each hit; see `texel_taps`.
 
-        Blended over 1 - p, of pixels p texels wide, the mean over a pixel is bilinear; blended
-        over the cell of a ray, it is exact: each texel has the weight of its area.
+        Pixels are p texels wide. Blended over 1 - p, the mean over a pixel is bilinear; blended
+        over the cell of a ray, each texel has the weight of its area: exactly where the axes of
+        texture and image agree, nearly elsewhere.
         """
         distance = np.ones(len(hits.ray))
         if camera.kind != ORTHOGRAPHIC:
