@@ -20,6 +20,7 @@ import distributed
 import numpy as np
 import psutil
 import pytest
+from hypothesis import settings
 
 try:
     import fcntl
@@ -36,6 +37,14 @@ SEED = 20060905  # one seed for all; change it with --seed
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests that take minutes")
     parser.addoption("--seed", type=int, default=SEED, help="seed of the `rng` fixture")
+
+
+def pytest_configure(config):
+    """The same examples in each run; `--slow` and `--hypothesis-seed` look for new ones."""
+    settings.register_profile("same", derandomize=True)
+    new = config.getoption("--slow") or config.getoption("--hypothesis-seed", None)
+    if not new and not config.getoption("--hypothesis-profile", None):
+        settings.load_profile("same")
 
 
 def pytest_collection_modifyitems(config, items):

@@ -29,6 +29,8 @@ BLOCK = 128
 FIT_PARTS = 8
 # Weight of the mean node in the preconditioner: nodes that hardly any sample touches stay.
 LEAST_TOUCH = 1e-3
+# Relative error of sums that are taken in single precision, over some ten products each.
+SUM_ERROR = 16 * float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True)
@@ -203,15 +205,19 @@ class _TargetFit:
         rest, touched = self.sums(values, with_samples=True)
         scale = 1.0 / (touched + LEAST_TOUCH * touched.mean() + 1e-300)
         direction = scale * rest
-        power = np.vdot(rest, direction)
+        first = power = np.vdot(rest, direction)
         for _ in range(n_steps):
             product, _ = self.sums(direction.astype(np.float32), with_samples=False)
             curvature = -np.vdot(direction, product)
-            if not curvature > 0.0:
+            # A direction that no sample determines: its curvature is rounding.
+            if not curvature > SUM_ERROR * np.vdot(direction, direction / scale):
                 break
             nodes += (power / curvature) * direction
             rest += (power / curvature) * product
             before, power = power, np.vdot(rest, scale * rest)
+            # What is left is rounding, which further steps would only amplify.
+            if not power > SUM_ERROR**2 * first:
+                break
             direction = scale * rest + (power / before) * direction
         return nodes.astype(np.float32)
 
