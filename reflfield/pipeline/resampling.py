@@ -44,9 +44,10 @@ class Resampled:
 
 def fits_in_one_pass(context: Context, options: CompressionOptions) -> bool:
     """Whether texels get clusters and coefficients in one pass (`pipeline.one_view_fit`)."""
+    if not context.photometric or options.size > 0 or options.psnr > 0:
+        return False
     n = results.observed(context).count() / max(len(results.measured_texels(context)), 1)
-    searches = options.size > 0 or options.psnr > 0
-    return context.photometric and options.fits_samples(n) and not searches
+    return options.fits_samples(n)
 
 
 def texels_read(context: Context) -> dict[str, str]:

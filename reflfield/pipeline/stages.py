@@ -196,7 +196,7 @@ ALIGNMENT = Stage(
     "alignment",
     alignment.write_alignment,
     after=(OBSERVATIONS, COMPLETION),
-    options=lambda options: (options.alignment, options.seed),
+    options=lambda options: (options.alignment, options.resampling, options.seed),
     wanted=lambda context: context.options.aligns,
 )
 # raw samples again, in the aligned frames, on the grid; missing samples filled
@@ -205,6 +205,7 @@ RESAMPLING = Stage(
     resampling.write_resampling,
     after=(ALIGNMENT,),
     options=lambda options: (
+        options.resampling,
         options.compression.rank,
         options.compression.training_texels,
         options.seed,
