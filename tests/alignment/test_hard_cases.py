@@ -316,5 +316,5 @@ def test_target_of_two_samples_stays_of_their_size(bounded):
         3.2,
         case="one observed sample",
         quantity="largest node of their target, over the samples",
-        source="(4/3)^4 = 3.2: largest tap of a cubic B-spline over its squared taps, four axes",
+        source="(4/3)^4 = 3.2: largest tap of a B-spline over its squared taps, four axes",
     )

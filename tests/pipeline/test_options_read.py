@@ -1,6 +1,6 @@
 """What a stage reads of the options is part of its key, or of the key of a stage before it.
 
-An option that is read and not in the key is changed without effect: the earlier result is taken.
+An option that is read and not in the key is changed without effect: the earlier result stays.
 """
 
 import sys
@@ -101,10 +101,8 @@ class Reads:
 def copied(frame):
     """Whether options are read to be copied, or checked as they are made: not for a result."""
     while frame is not None:
-        if (
-            "__post_init__" == frame.f_code.co_name
-            or frame.f_globals["__name__"] == "dataclasses"
-        ):
+        made = frame.f_code.co_name == "__post_init__"
+        if made or frame.f_globals["__name__"] == "dataclasses":
             return True
         frame = frame.f_back
     return False
