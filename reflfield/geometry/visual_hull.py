@@ -99,6 +99,9 @@ class HullOptions:
     bounds : pair of (3,) float, optional
         Lowest and highest corner of a box, metres, to use instead of the one found from
         the silhouettes: needed where the object leaves the frame in too many views.
+    hollows : bool
+        Carve what no silhouette shows to be empty but photographs under several lights do; see
+        `geometry.hollow_carving`.
     """
 
     resolution: int = 192
@@ -108,6 +111,7 @@ class HullOptions:
     n_triangles: int = 20_000
     minimum_component: float = 0.01
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    hollows: bool = True
 
     def __post_init__(self) -> None:
         if not 8 <= self.resolution <= _LARGEST_RESOLUTION:
@@ -145,6 +149,8 @@ class HullReport:
         Of the final mesh, m^3 and m^2.
     n_triangles : int
         Of the final mesh.
+    tolerance : int
+        Views that may disagree at a point of this hull.
     overlap : (n_views,) float64
         Intersection over union of the mesh's silhouette and the given one, for pixels in
         the frame. Far below 1: calibration or silhouette of that view disagrees.
@@ -168,6 +174,7 @@ class HullReport:
     volume: float
     area: float
     n_triangles: int
+    tolerance: int
     overlap: Array
     missing: Array
     leaves_image: NDArray[np.bool_]
@@ -240,6 +247,7 @@ def visual_hull(
         volume=mesh.volume,
         area=mesh.area,
         n_triangles=len(mesh.faces),
+        tolerance=outcome.carved.tolerance,
         overlap=agreement.overlap,
         missing=agreement.missing,
         leaves_image=np.array([view.outline.leaves_image for view in views]),
@@ -258,6 +266,7 @@ class _Carved:
     mesh: Mesh
     grid: Grid
     n_evaluated: int
+    tolerance: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +284,7 @@ def _carved(views: Sequence[View], options: HullOptions, tolerance: int) -> _Car
     low, high = np.array(options.bounds or object_bounds(views, tolerance))
     grid = Grid.around(low, high, options.resolution)
     volume, n_evaluated = carve(views, grid, tolerance)
-    return _Carved(_surface(volume, grid, options, views), grid, n_evaluated)
+    return _Carved(closed_surface(volume, grid, options, views), grid, n_evaluated, tolerance)
 
 
 def _hull_of_made(
@@ -466,7 +475,7 @@ def _check_inside(volume: NDArray[np.float32], views: Sequence[View]) -> None:
         )
 
 
-def _surface(
+def closed_surface(
     volume: NDArray[np.float32], grid: Grid, options: HullOptions, views: Sequence[View]
 ) -> Mesh:
     """Closed mesh of the zero level, cleaned as the options say."""

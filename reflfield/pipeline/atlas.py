@@ -32,7 +32,7 @@ def write_atlas(context: Context, folder: Path) -> dict[str, Any]:
         warnings: list[str] = []
     else:
         options = context.options.atlas
-        mesh = results.hull_mesh(context)
+        mesh = results.base_mesh(context)
         resolution = options.resolution or derived_resolution(context, mesh)
         built = built_atlas(mesh, replace(options, resolution=resolution))
         atlas, method = built.atlas, built.method

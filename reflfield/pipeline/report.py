@@ -30,6 +30,7 @@ from reflfield.pipeline.cache import plain, versions
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.held_out_silhouettes import silhouettes_of
+from reflfield.pipeline.hollows import SHARE
 from reflfield.pipeline.hull import LEFT_OUT
 from reflfield.pipeline.maps import AVERAGES
 from reflfield.pipeline.quantisation_search import missed_quality
@@ -149,7 +150,7 @@ def _surface_sections(
 ) -> Iterator[Section]:
     texels = results.texels(context)
     origin = context.training.silhouette_origin(0)
-    hull, made = context.stages.record("hull"), context.stages.record("atlas")
+    hull, hollows, made = map(context.stages.record, ("hull", "hollows", "atlas"))
     yield sections.silhouettes_section(
         _silhouette_views(context),
         origin={
@@ -157,6 +158,7 @@ def _surface_sections(
             "alpha": "alpha of the photographs",
         }.get(origin, "made from the photographs"),
         left_out=() if hull is None else hull.counts.get(LEFT_OUT, ()),
+        carved=0.0 if hollows is None else float(hollows.counts[SHARE]),
     )
     yield sections.atlas_section(
         texels.texel_of_pixel,

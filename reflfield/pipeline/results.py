@@ -79,8 +79,16 @@ def silhouettes(context: Context) -> StoredSilhouettes:
 
 @cached("hull")
 def hull_mesh(context: Context) -> Mesh:
-    """Base surface."""
+    """The visual hull; of a flat object, the image plane."""
     return read_ply(file(context, "hull", "hull.ply"))
+
+
+@cached("hull", "hollows")
+def base_mesh(context: Context) -> Mesh:
+    """Base surface: the hull, or what is left of it where hollows were carved."""
+    carved = file(context, "hollows", "carved.ply")
+    ran = context.stages.record("hollows") is not None
+    return read_ply(carved) if ran and carved.is_file() else hull_mesh(context)
 
 
 @cached("surface_mesh")

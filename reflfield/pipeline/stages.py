@@ -26,6 +26,7 @@ from reflfield.pipeline import (
     compression,
     error_analysis,
     held_out_silhouettes,
+    hollows,
     hull,
     indirect,
     left_out_views,
@@ -88,11 +89,20 @@ HULL = Stage(
     options=lambda options: options.hull,
     reads=stage_inputs.lights_digest,
 )
+# photographs that contradict the hull -> the hull without its hollows
+HOLLOWS = Stage(
+    "hollows",
+    hollows.write_hollows,
+    after=(HULL,),
+    options=lambda options: options.hull,
+    reads=stage_inputs.photographs_digest,
+    wanted=hollows.has_common_lights,
+)
 # mesh -> UV charts -> texel table
 ATLAS = Stage(
     "atlas",
     atlas.write_atlas,
-    after=(HULL,),
+    after=(HULL, HOLLOWS),
     options=lambda options: (options.atlas, options.texture),
 )
 # which camera and which light each texel sees
@@ -279,6 +289,7 @@ REPORT = Stage(
 ORDER = (
     SILHOUETTES,
     HULL,
+    HOLLOWS,
     ATLAS,
     VISIBILITY,
     OBSERVATIONS,

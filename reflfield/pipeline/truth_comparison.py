@@ -97,6 +97,8 @@ def surface_scores(context: Context, truth: Truth) -> dict[str, HullDistance]:
     """Distances of hull and surface to the true one, also in voxels of the hull's grid."""
     details = json.loads((context.stages.root / "hull" / "hull.json").read_text())
     meshes = {"hull": results.hull_mesh(context)}
+    if (base := results.base_mesh(context)) is not meshes["hull"]:
+        meshes["hull without hollows"] = base
     if context.refined.on_surface:
         meshes["surface from normals"] = results.surface_mesh(context)
     return {

@@ -285,6 +285,7 @@ Work = Callable[[WorkCounts, PipelineOptions], dict[str, float]]
 WORK: dict[str, Work] = {
     "silhouettes": _silhouettes,
     "hull": _hull,
+    "hollows": lambda counts, options: {"observations, pixels": counts.glanced_pixels * UNIT},
     "atlas": _atlas,
     "visibility": _visibility,
     "observations": _observations,
@@ -313,7 +314,7 @@ def memory_of(stage: str, counts: WorkCounts, options: PipelineOptions) -> dict[
     """Amounts that the peak of a stage's memory grows with."""
     fits = stage in ("surface", "compression", "without_alignment", "alignment", "completion")
     held = {"libraries": 1.0, "held, texels": counts.n_texels * UNIT}
-    if stage in ("silhouettes", "hull", "atlas"):
+    if stage in ("silhouettes", "hull", "hollows", "atlas"):
         return {"libraries, early": 1.0, "hull, memory": float(not counts.is_plane)}
     if not fits:
         return held | {"held, pixels": counts.largest_pixels * UNIT}

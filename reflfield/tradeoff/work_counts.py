@@ -15,6 +15,7 @@ from reflfield.pipeline.atlas import TYPICAL_USE
 from reflfield.pipeline.cache import StageFolder
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.context import AUTO, Context
+from reflfield.pipeline.hollows import GLANCE_LIGHTS
 from reflfield.pipeline.model_selection import can_fit_samples, least_samples
 from reflfield.pipeline.pipeline_options import SMALLEST_TEXTURE, PipelineOptions
 
@@ -88,6 +89,13 @@ class WorkCounts:
     is_plane: bool
     shades: bool
     one_view: bool
+
+    @property
+    def glanced_pixels(self) -> float:
+        """Pixels of the photographs that are searched for hollows; most objects have none."""
+        if self.is_plane or self.n_views == 1:
+            return 0.0
+        return min(GLANCE_LIGHTS / max(self.n_lights, 1), 1.0) * self.photograph_pixels
 
 
 def planned_context(

@@ -52,6 +52,7 @@ def silhouettes_section(
     origin: str = "",
     max_pictures: int = 12,
     left_out: Collection[str] = (),
+    carved: float = 0.0,
 ) -> Section:
     """Silhouettes against the hull: outlines over photographs, agreement per view.
 
@@ -65,6 +66,8 @@ def silhouettes_section(
         Views with the lowest IoU are shown.
     left_out : collection of str
         Names of views that are excluded from the hull.
+    carved : float
+        Share of the hull's volume that was carved because photographs contradict it.
 
     Returns
     -------
@@ -110,6 +113,11 @@ def silhouettes_section(
     if rows:
         overlaps = [row[1] for row in rows]
         intro += f" IoU: median {np.median(overlaps):.3f}, least {min(overlaps):.3f}."
+    if carved:
+        intro += (
+            f" Hollows that no silhouette shows, {carved:.0%} of the hull's volume, are carved "
+            "where photographs contradict the hull."
+        )
     return Section("Silhouettes and hull", intro, (figure, table))
 
 
