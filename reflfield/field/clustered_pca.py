@@ -39,8 +39,8 @@ LEAST_SPREAD = 1e-9
 NEAREST_PAIRS = 8
 
 
-# Clusters and components, usually, and of one view under known lights.
-USUAL_COUNTS, ONE_VIEW_COUNTS = (8, 6), (16, 12)
+# Clusters, components and relative step, usually, and of one view under known lights.
+USUAL_COUNTS, ONE_VIEW_COUNTS = (8, 6, 0.5), (16, 12, 0.25)
 # Models of a field.
 CLUSTERED, HALF_VECTOR = "clustered", "half_vector"
 
@@ -80,9 +80,10 @@ class CompressionOptions:
     psnr : float
         LDR PSNR, dB, that the field is to have on the samples that it is made of, 0: as it
         comes. Clusters, components and quantisation are then chosen for the smallest file.
-    relative_step : float
+    relative_step : float or "auto"
         Quantisation step of the field over the root mean square residual of the fit. At a
-        half, quantisation adds some percent to the error; see `Quantisation`.
+        half, quantisation adds some percent to the error; see `Quantisation`. "auto" is a half,
+        and of one view under known lights a quarter: its fields are small.
     """
 
     model: str = "auto"
@@ -95,7 +96,7 @@ class CompressionOptions:
     samples: SampleFitOptions = field(default_factory=SampleFitOptions)
     size: int = 0
     psnr: float = 0.0
-    relative_step: float = 0.5
+    relative_step: float | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
         if self.model not in ("auto", CLUSTERED, HALF_VECTOR):
@@ -125,7 +126,9 @@ class CompressionOptions:
                 f"size, psnr: expected one of them, received {self.size} bytes and "
                 f"{self.psnr} dB"
             )
-        check_ranges(self, {"psnr": (0, MOST_PSNR), "relative_step": (1e-3, 1e3)})
+        check_ranges(self, {"psnr": (0, MOST_PSNR)})
+        if self.relative_step != "auto":
+            check_ranges(self, {"relative_step": (1e-3, 1e3)})
 
     @property
     def clusters(self) -> int:
@@ -137,21 +140,29 @@ class CompressionOptions:
         """Number of components; the usual one where none is stated."""
         return USUAL_COUNTS[1] if self.n_components == "auto" else self.n_components
 
-    def with_counts(self, clusters: int, components: int) -> CompressionOptions:
-        """Options with these counts in place of "auto".
+    @property
+    def step(self) -> float:
+        """Relative step; the usual one where none is stated."""
+        return USUAL_COUNTS[2] if self.relative_step == "auto" else self.relative_step
+
+    def with_counts(
+        self, clusters: int, components: int, relative_step: float
+    ) -> CompressionOptions:
+        """Options with these counts and step in place of "auto".
 
         Examples
         --------
-        >>> options = CompressionOptions(n_components=4).with_counts(12, 10)
-        >>> options.n_clusters, options.n_components
-        (12, 4)
+        >>> options = CompressionOptions(n_components=4).with_counts(12, 10, 0.5)
+        >>> options.n_clusters, options.n_components, options.relative_step
+        (12, 4, 0.5)
         """
-        if "auto" not in (self.n_clusters, self.n_components):
+        if "auto" not in (self.n_clusters, self.n_components, self.relative_step):
             return self
         return replace(
             self,
             n_clusters=clusters if self.n_clusters == "auto" else self.n_clusters,
             n_components=components if self.n_components == "auto" else self.n_components,
+            relative_step=relative_step if self.relative_step == "auto" else self.relative_step,
         )
 
     def fits_samples(self, n_samples: float) -> bool:

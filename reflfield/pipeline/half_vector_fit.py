@@ -296,7 +296,7 @@ class HalfVectorFit:
     def made(self, model: HalfVectorModel) -> HalfVectorField:
         """Field of the size, the quality or the relative step that was asked for."""
         options = self.context.options.compression
-        step = self.step(options.relative_step)
+        step = self.step(options.step)
 
         def build(at: float) -> HalfVectorField:
             return self.build(model, at)

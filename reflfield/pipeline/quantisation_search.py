@@ -96,7 +96,7 @@ class FieldMaker:
     def made(self, model: ClusteredModel, frames: Floats) -> ClusteredField:
         """Field of the size, the quality or the relative step that was asked for."""
         options = self.options
-        step = options.relative_step * model.residuals[-1]
+        step = options.step * model.residuals[-1]
 
         def build(at: float) -> ClusteredField:
             return self.build(model, frames, at)

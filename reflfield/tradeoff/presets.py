@@ -10,6 +10,7 @@ from reflfield.errors import InputError
 from reflfield.field.clustered_pca import CLUSTERED
 from reflfield.options import HoldOut, Resources, with_tables
 from reflfield.pipeline import stages
+from reflfield.pipeline.context import Context
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.report.page import format_seconds
 from reflfield.tradeoff.machine_speed import machine_seconds, slowness
@@ -59,6 +60,8 @@ PRESETS = (PREVIEW, STANDARD, BEST)
 # Of a preview by clusters: one fit, the quick one, which to ask for of other captures would ask
 # for clusters; and nodes of the grids along a side, where there would be more.
 QUICK_FIT: Settings = {"compression.fit": "grid"}
+# Of the best of one view under known lights, where it is worth the time.
+ONE_VIEW_BEST: Settings = {"compression.rank": 48, "compression.n_components": 16}
 MOST_NODES = 7
 
 
@@ -110,12 +113,19 @@ def preset_settings(name: str, capture: Capture | None = None) -> dict[str, Valu
     settings = dict(LADDER[name])
     if name == PREVIEW and capture is not None:
         settings |= quick_clusters(capture)
+    if name == BEST and capture is not None and default_context(capture).photometric:
+        settings |= ONE_VIEW_BEST
     return settings
+
+
+def default_context(capture: Capture) -> Context:
+    """Return the context of a run with the default of every option."""
+    return planned_context(capture, PipelineOptions())
 
 
 def quick_clusters(capture: Capture) -> dict[str, Value]:
     """Settings of a preview by clusters; none where fields of the capture have none."""
-    context = planned_context(capture, PipelineOptions())
+    context = default_context(capture)
     if planned_model(context) != CLUSTERED:
         return {}
     sides = zip(("view_side", "light_side"), context.grid_sides, strict=True)
