@@ -183,7 +183,7 @@ def projection_matrix(camera: Camera) -> Array:
     --------
     >>> camera = Camera("v", "opencv", 4, 4, 2.0, 2.0, 2.0, 2.0, np.eye(4))
     >>> x, y, w = projection_matrix(camera) @ [1.0, 0.0, 4.0, 1.0]
-    >>> x / w, y / w
+    >>> float(x / w), float(y / w)
     (2.5, 2.0)
     """
     pose = camera.camera_from_world[:3].copy()

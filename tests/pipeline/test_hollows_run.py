@@ -78,6 +78,7 @@ def test_base_mesh_is_the_bowl_and_the_hull_stays(context, bowl):
     # Pixels of 4 mm, voxels of 1.7.
     assert off_truth(context, bowl, base) < 0.001
     assert context.stages.record("hollows").counts[SHARE] > 0.5
+    # Charts hold positions in single precision.
     assert results.atlas(context).mesh.volume == pytest.approx(base.volume, rel=1e-6)
 
 

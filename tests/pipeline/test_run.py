@@ -23,6 +23,7 @@ from reflfield.util.nested_tables import merged
 # The tiny options ask for the clustered model, which keeps the hull.
 SKIPPED = (
     *("left_out_views", "model_selection", "surface"),
+    "hollows",  # of fewer than eight lights
     *("surface_visibility", "surface_observations", "surface_indirect"),
 )
 RAN = tuple(stage for stage in STAGES if stage not in SKIPPED)
