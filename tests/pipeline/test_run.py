@@ -58,11 +58,11 @@ def digest(path):
 
 
 def digests(folder):
-    """SHA-256 of every file; times and what was skipped differ from run to run."""
+    """SHA-256 of every file; times, and when inputs were hashed, differ from run to run."""
     return {
         str(path.relative_to(folder)): digest(path)
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != "timings.json"
+        if path.is_file() and path.name not in ("timings.json", "files.json")
     }
 
 
