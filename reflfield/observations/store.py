@@ -47,6 +47,9 @@ TEXELS_COUNTED = 8192
 # Views of a chunk: those whose samples a writer holds together.
 VIEWS_PER_CHUNK = 8
 WRITER_BYTES = 128 << 20
+# Samples of one view up to which they are written together: of a picture of twelve megapixels
+# under many lights a few lights at a time.
+MOST_VIEW_BYTES = 512 << 20
 SAMPLE_BYTES = 6
 # In a store: what the folders of samples are called, before the key of their stage.
 SAMPLES_PREFIX = "samples-"
@@ -75,7 +78,8 @@ def _end_thread_of_zarr() -> None:
 def chunk_shape(n_texels: int, pairs: PhotographedPairs) -> tuple[int, int]:
     """Texels and photographs of a chunk; they follow from the counts, not from the memory.
 
-    Of a full product of views and lights the photographs are those of whole views.
+    Of a full product of views and lights the photographs are those of whole views, or parts of
+    one where its samples are more than `MOST_VIEW_BYTES`.
 
     Examples
     --------
@@ -87,9 +91,12 @@ def chunk_shape(n_texels: int, pairs: PhotographedPairs) -> tuple[int, int]:
     (4096, 8)
     >>> chunk_shape(40_000, PhotographedPairs.of_table(np.eye(240)))
     (4096, 8)
+    >>> chunk_shape(12_000_000, PhotographedPairs.product(1, 64))
+    (4096, 8)
     """
     n_views = max(len(np.unique(pairs.view)), 1)
     of_view = -(-len(pairs) // n_views)
+    of_view = -(-of_view // -(-n_texels * of_view * SAMPLE_BYTES // MOST_VIEW_BYTES))
     fit = WRITER_BYTES // (n_texels * of_view * SAMPLE_BYTES)
     photographs = of_view * int(np.clip(fit, 1, min(VIEWS_PER_CHUNK, n_views)))
     fits = CHUNK_BYTES / (photographs * SAMPLE_BYTES)

@@ -2,7 +2,8 @@
 
     python tests/benchmarks/bench_rti.py                  # 800 x 800 x 64, lion, gray sphere
     python tests/benchmarks/bench_rti.py plate --side 256
-    python tests/benchmarks/bench_rti.py scale --side 400 800 1789 3464 # .16 to 12 megapixels
+    python tests/benchmarks/bench_rti.py scale --side 400 800 1789         # .16 to 3.2 megapixels
+    python tests/benchmarks/bench_rti.py scale --side 800 3464 --max-memory 14GB
 
 `plate` is the simulated `rti_plate`, `lion` is rti_loewenkopf of the test data, `gray` the matt
 sphere of uw_photometric_stereo. `reflfield run` makes a field of all but some held-out lights
@@ -424,6 +425,7 @@ def measure_sizes(options, folder):
         here = folder / str(side)
         capture = simulated(side, here)
         words = ("run", capture, "-o", here / "out", "--workers", options.workers)
+        words = (*words, "--max-memory", options.max_memory)
         spent = ran("reflfield", words, here / "run.log")
         add_time(results, "plate", spent, side * side, 64)
     print(results.write())
@@ -439,6 +441,7 @@ def main():
     )
     parser.add_argument("--out", type=Path, help="folder in which captures and runs stay")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--max-memory", default="4GB", help="of the runs of `scale`")
     options = parser.parse_args()
     for name in options.names:
         if name not in names:

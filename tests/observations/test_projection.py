@@ -159,6 +159,20 @@ class TestProjection:
         got = project(capture_of(images, lights), [[0, 0, 0], [1, 1, 0]])
         assert np.array_equal(got[1, ..., 0], number[..., 0, 0, 0])
 
+    def test_lights_of_a_large_view_are_written_a_few_at_a_time(
+        self, capture_of, project, monkeypatch, rng
+    ):
+        lights = [lamp(f"l{i}") for i in range(7)]
+        capture = capture_of(rng.uniform(0.1, 1.0, (2, 7, HEIGHT, WIDTH, 3)), lights)
+        points = np.c_[rng.uniform(-2, 2, (9, 2)), np.zeros(9)]
+        whole = project(capture, points)
+        # Two parts of a view: four and three of its lights.
+        monkeypatch.setattr(store, "MOST_VIEW_BYTES", 9 * 4 * store.SAMPLE_BYTES)
+        assert store.chunk_shape(9, PhotographedPairs.of(capture)) == (9, 8)
+        monkeypatch.setattr(store, "VIEWS_PER_CHUNK", 1)
+        assert store.chunk_shape(9, PhotographedPairs.of(capture)) == (9, 4)
+        np.testing.assert_array_equal(project(capture, points), whole)
+
     def test_more_lights_than_are_read_together(self, capture_of, project):
         number = np.arange(70)[None, :, None, None, None]
         images = np.broadcast_to(number, (1, 70, HEIGHT, WIDTH, 3))
