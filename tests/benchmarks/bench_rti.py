@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_rti.py                  # 800 x 800 x 64, lion, gray sphere
     python tests/benchmarks/bench_rti.py plate --side 256
-    python tests/benchmarks/bench_rti.py scale --side 400 800 1789         # .16 to 3.2 megapixels
+    python tests/benchmarks/bench_rti.py scale --side 400 800 1789     # .16 to 3.2 megapixels
     python tests/benchmarks/bench_rti.py scale --side 800 3464 --max-memory 14GB
 
 `plate` is the simulated `rti_plate`, `lion` is rti_loewenkopf of the test data, `gray` the matt

@@ -9,8 +9,15 @@ from reflfield.errors import InputError
 from reflfield.options import HoldOut, Resources, parse_seconds
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.tradeoff import presets
-from reflfield.tradeoff.presets import LADDER, PRESETS, choose_within, preset_settings
+from reflfield.tradeoff.presets import (
+    LADDER,
+    ONE_VIEW_BEST,
+    PRESETS,
+    choose_within,
+    preset_settings,
+)
 from reflfield.tradeoff.swept_options import SWEPT
+from reflfield.tradeoff.work_counts import planned_context
 
 HELD_OUT = HoldOut(views=1, lights=1)
 
@@ -85,6 +92,11 @@ def test_a_preview_of_one_view_has_few_nodes(product):
     assert settings["compression.fit"] == "grid"
     # Ten lights have a grid of five nodes along a side, of which none is taken away.
     assert "resampling.light_side" not in settings
+    best = preset_settings("best", one_view)
+    assert best == {**preset_settings("best"), **ONE_VIEW_BEST}
+    context = planned_context(one_view, PipelineOptions())
+    assert context.options.compression.step == 0.25
+    assert planned_context(product, PipelineOptions()).options.compression.step == 0.5
 
 
 def test_a_preview_of_a_dome_asks_for_no_clusters(product):
