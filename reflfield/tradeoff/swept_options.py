@@ -25,6 +25,13 @@ SHOWING = ("relighting.samples_per_pixel",)
 DEFAULT_NAME = "default"
 MIXED = 1e-3
 
+# Options of frames that are searched for by correlation.
+OF_SEARCHED_FRAMES = (
+    *("completion.passes", "completion.rank", "completion.method"),
+    *("alignment.iterations", "alignment.refine", "alignment.band_limit"),
+    "alignment.n_clusters",
+)
+
 
 @dataclass(frozen=True)
 class SweptOption:
@@ -60,6 +67,8 @@ class SweptOption:
             "resampling.light_side": counts.n_lights > 1,
             "indirect.enabled": counts.shades,
             "indirect.n_components": counts.shades,
+            # Whose frames are those of photometric stereo, of samples that are not completed.
+            **dict.fromkeys(OF_SEARCHED_FRAMES, not counts.one_view),
         }
         usable = counts.model in self.models and not (self.solid and counts.is_plane)
         return usable and needed.get(self.name, True)

@@ -6,7 +6,7 @@ import pytest
 
 from reflfield.api.reconstruction import read_options
 from reflfield.errors import InputError
-from reflfield.options import HoldOut, Resources, parse_seconds
+from reflfield.options import HoldOut, Resources, parse_seconds, with_tables
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.tradeoff import presets
 from reflfield.tradeoff.presets import (
@@ -16,8 +16,8 @@ from reflfield.tradeoff.presets import (
     choose_within,
     preset_settings,
 )
-from reflfield.tradeoff.swept_options import SWEPT
-from reflfield.tradeoff.work_counts import planned_context
+from reflfield.tradeoff.swept_options import OF_SEARCHED_FRAMES, SWEPT
+from reflfield.tradeoff.work_counts import counts_of, planned_context
 
 HELD_OUT = HoldOut(views=1, lights=1)
 
@@ -97,6 +97,19 @@ def test_a_preview_of_one_view_has_few_nodes(product):
     context = planned_context(one_view, PipelineOptions())
     assert context.options.compression.step == 0.25
     assert planned_context(product, PipelineOptions()).options.compression.step == 0.5
+
+
+def test_searches_for_frames_are_swept_where_frames_are_searched_for(product):
+    of_first = tuple(p for p in product.photographs if p.camera == 0)
+    one_view = replace(product, photographs=of_first, base_geometry="plane").subset([0])
+    clusters = with_tables(PipelineOptions(), {"compression": {"model": "clustered"}})
+    swept = {}
+    for name, capture in (("one view", one_view), ("dome", product)):
+        counts = counts_of(planned_context(capture, clusters), 0.5)
+        swept[name] = {option.name for option in SWEPT if option.matters(counts)}
+    searches = {name for name in swept["dome"] if name.startswith(("completion", "alignment"))}
+    assert searches == {*OF_SEARCHED_FRAMES, "alignment.enabled"}
+    assert searches & swept["one view"] == {"alignment.enabled"}
 
 
 def test_a_preview_of_a_dome_asks_for_no_clusters(product):
