@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 # crossings are one row (or column) apart, at most the diagonal of a pixel along the outline.
 _HALF_PIECE = 0.75
 
+# Squares of distances below this, pixels, are exact in single precision.
+EXACT_PX = 1024
+
 # Within this distance of the outline, pixels, distances are measured to its pieces;
 # beyond, to the nearest crossing (an error of at most _HALF_PIECE^2 / 2 / distance).
 _FINE_BAND = 4.0
@@ -157,11 +160,24 @@ def _checked(silhouette: NDArray[np.floating], name: str) -> NDArray[np.floating
 def _coarse_distance(covered: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance of pixel centres to the boundary between pixels, about half a pixel."""
     inside, outside = (
-        cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        _repeatable(
+            cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        )
         for part in (covered, ~covered)
     )
     half = np.float32(0.5)
     return np.where(covered, inside - half, half - outside)
+
+
+def _repeatable(distance: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Distances between pixels, whose squares are whole numbers, rounded correctly.
+
+    The last bit of OpenCV's depends on where in memory its arrays lie; that of a hull must not.
+    Squares of far ones are no longer told apart in single precision: an eighth of a pixel is.
+    """
+    near = np.sqrt(np.rint(distance * distance))
+    far = np.rint(8 * distance) / 8
+    return np.asarray(np.where(distance < EXACT_PX, near, far), np.float32)
 
 
 def _rim_points(covered: NDArray[np.bool_]) -> Array:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry.silhouette_distance import signed_distance
+from reflfield.geometry.silhouette_distance import _coarse_distance, signed_distance
 
 SIZE, SUPERSAMPLING = 96, 16
 centres = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=-1)
@@ -81,3 +81,28 @@ def test_what_is_no_coverage_is_refused(value):
     silhouette[1, 1] = value
     with pytest.raises(InputError, match=r"coverage in \[0, 1\]"):
         signed_distance(silhouette)
+
+
+def test_distances_do_not_depend_on_where_arrays_lie():
+    """OpenCV's differ in the last bit with the alignment of its arrays."""
+    rows, columns = np.mgrid[:67, :131]
+    covered = (rows - 30) ** 2 + (columns - 50) ** 2 < 400
+    expected = _coarse_distance(covered)
+    for offset in range(1, 17):
+        room = np.zeros(covered.size + 64, np.bool_)
+        moved = room[offset : offset + covered.size].reshape(covered.shape)
+        moved[:] = covered
+        np.testing.assert_array_equal(_coarse_distance(moved), expected)
+    # Correctly rounded square roots of whole numbers.
+    inside = expected[covered].astype(np.float64) + 0.5
+    squares = np.rint(inside**2)
+    np.testing.assert_array_equal(
+        expected[covered], np.sqrt(squares.astype(np.float32)) - np.float32(0.5)
+    )
+
+
+def test_far_distances_are_those_to_an_eighth_of_a_pixel():
+    covered = np.zeros((3, 3000), np.bool_)
+    covered[:, :10] = True
+    far = _coarse_distance(covered)[1]
+    np.testing.assert_array_equal(far[1000:], 9.5 - np.arange(1000, 3000))

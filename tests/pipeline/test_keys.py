@@ -26,7 +26,12 @@ OPTIONS = with_tables(
     PipelineOptions(),
     {
         "resampling": {"visibility": "factored"},
-        "compression": {"fit": "samples", "n_clusters": 8, "n_components": 6},
+        "compression": {
+            "fit": "samples",
+            "n_clusters": 8,
+            "n_components": 6,
+            "relative_step": 0.5,
+        },
         "comparison": {"without_alignment": True, "rate_distortion": True},
     },
 )
