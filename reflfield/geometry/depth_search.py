@@ -46,9 +46,11 @@ LEAST_LIGHTS = 8
 # the surface is instead, and how many steps it must lie inside.
 CONTRADICTION = 0.02
 CLEARLY_LESS, LEAST_INSIDE = 0.5, 3.0
-# Error up to which views show the same: 0.01 of clay, .05 of glaze, .08 of metal.
+# Error up to which views show the same. Where they do, it is .01 of simulated clay, .05 of
+# glaze and .08 of gold (`tests/benchmarks/bench_hollows.py`).
 ALIKE = 0.045
-# Mean over the lights, of the root mean square of all views, below which a pixel is too dark.
+# Of the root mean square of all views: a pixel whose mean over the lights is below is too dark
+# to be compared.
 DARK = 0.4
 # Pixels of the 8 around it that a moved pixel must agree with, within so many steps.
 SUPPORT, SUPPORT_STEPS = 3, 8.0
@@ -331,6 +333,7 @@ def _difference(views: _Views, own: Floats, j: int, u: float, v: float) -> float
         total += min(abs(mine - other), truncation)
         weight += max(mine, other)
         n += 1
+    # Too few lights in common, or too little light, say nothing.
     if n < 3 * LEAST_LIGHTS or not weight > DARK / TRUNCATION * truncation * n:
         return np.inf
     return float(total / weight)

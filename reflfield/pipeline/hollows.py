@@ -27,7 +27,7 @@ MOST_LIGHTS, GLANCE_LIGHTS = 32, 12
 LONGEST_PX = 160
 # Share of the memory that the reduced views may take.
 MEMORY_SHARE = 1 / 8
-# Other views that see a surface, and that one of them is compared with.
+# Views that must have a photograph under a light for it to count as common to them.
 LEAST_VIEWS = 6
 # Of the hull's volume, and what the stage writes where there is something to carve.
 SHARE, CARVED = "share of the volume carved", "carved.ply"
