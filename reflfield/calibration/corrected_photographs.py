@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.capture import Capture, Exposure
+from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import SATURATED
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.image_writing import write_exr, write_png
+from reflfield.capture.photographs import Exposure
 from reflfield.util.progress import track
 
 Float32 = NDArray[np.float32]

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.capture import Capture, usual_base_geometry
 from reflfield.capture.documents import check_counts
 from reflfield.capture.image_files import AS_STATED, ImageReading, image_size
 from reflfield.capture.lights import Light
 from reflfield.capture.names import unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.capture.unique_items import UniqueItems, camera_key, leading_digits, numbered
 from reflfield.capture.view_folders import ViewFolders
 from reflfield.errors import CaptureError

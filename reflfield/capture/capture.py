@@ -13,22 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.clipping import kinds_of_bracket
-from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.digest_text import camera_text, dark_pieces, light_text
-from reflfield.capture.exposures import merge_exposures
-from reflfield.capture.image_files import (
-    AS_STATED,
-    ImageReading,
-    read_alpha,
-    read_coverage,
-    read_described,
-    read_exposure,
-    read_image,
-    stores_alpha,
-)
+from reflfield.capture.image_files import ImageReading, read_coverage, stores_alpha
 from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.names import check_unique
+from reflfield.capture.photographs import Photograph
 from reflfield.capture.segmentation import silhouette_from_photographs
 from reflfield.errors import CaptureError
 from reflfield.util.file_digests import file_digest
@@ -41,93 +30,6 @@ SILHOUETTE_SAMPLE = 32
 # SHA-256 of a file; the type is that of an error to raise.
 FileDigest: TypeAlias = Callable[[Path, type[CaptureError]], bytes]
 DIGEST_PARTS = ("cameras", "lights", "silhouettes", "photographs")
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One file of a photograph.
-
-    Parameters
-    ----------
-    path : Path
-    seconds : float
-        Exposure time, where exposures are bracketed.
-    reading : ImageReading
-        Encoding, layer and white level, where the file does not say them.
-    """
-
-    path: Path
-    seconds: float = 1.0
-    reading: ImageReading = AS_STATED
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """What one camera saw under one light.
-
-    Parameters
-    ----------
-    name : str
-        File stem; names of relit frames are taken from it.
-    camera, light : int
-        Indices into the capture's cameras and lights.
-    exposures : tuple of Exposure
-        One file, or several bracketed ones.
-    is_test : bool
-        True where the capture's maker keeps the photograph for comparison.
-    dark : DarkFrame, optional
-        What the camera sees without any lamp: it is subtracted.
-    """
-
-    name: str
-    camera: int
-    light: int
-    exposures: tuple[Exposure, ...]
-    is_test: bool = False
-    dark: DarkFrame | None = None
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """All files that it is read from."""
-        dark = () if self.dark is None else (self.dark.path,)
-        return (*(exposure.path for exposure in self.exposures), *dark)
-
-    @property
-    def path(self) -> Path:
-        """The first file."""
-        return self.exposures[0].path
-
-    def read(self) -> NDArray[np.float32]:
-        """Linear radiance, (h, w, 3) float32; bracketed exposures are merged."""
-        if len(self.exposures) == 1 and self.dark is None:
-            first = self.exposures[0]
-            return read_image(first.path, first.reading) / np.float32(first.seconds)
-        return self.read_kinds()[0]
-
-    def read_kinds(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Radiance and which of its values are measurements (`Capture.read_kinds`)."""
-        first = self.exposures[0]
-        if len(self.exposures) == 1:
-            read = read_described(first.path, first.reading)
-            image, kinds = read.image / np.float32(first.seconds), read.kinds
-        else:
-            image, kinds = self._read_bracket()
-        if self.dark is None:
-            return image, kinds
-        if len(self.exposures) > 1:
-            read = read_described(first.path, first.reading)
-        return self.dark.subtracted(image, kinds, read)
-
-    def _read_bracket(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        read = [read_exposure(e.path, e.reading) for e in self.exposures]
-        images, kinds, encodings = zip(*read, strict=True)
-        seconds = [e.seconds for e in self.exposures]
-        return merge_exposures(images, seconds, encodings), kinds_of_bracket(kinds, seconds)
-
-    def read_alpha(self) -> NDArray[np.float32] | None:
-        """Alpha of the first file, (h, w) float32; None if it has none or is opaque."""
-        first = self.exposures[0]
-        return read_alpha(first.path, first.reading)
 
 
 @dataclass(frozen=True, eq=False)

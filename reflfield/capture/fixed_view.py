@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import PLANE, Capture, Exposure, Photograph
+from reflfield.capture.capture import PLANE, Capture
 from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.documents import check_counts
 from reflfield.capture.encoding import LINEAR, Encoding
@@ -20,6 +20,7 @@ from reflfield.capture.image_headers import read_header
 from reflfield.capture.lights import Light
 from reflfield.capture.names import IMAGE_SUFFIXES, unique_names
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import CaptureError
 from reflfield.util.quoting import listed, printable
 

@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.described_items import described_light
 from reflfield.capture.documents import (
     MAX_PHOTOGRAPHS,
@@ -42,6 +42,7 @@ from reflfield.capture.fixed_view import notes_on_lengths
 from reflfield.capture.lights import Light
 from reflfield.capture.names import IMAGE_SUFFIXES, frame_name, unique_names
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.capture.unique_items import UniqueItems, leading_digits, numbered
 from reflfield.errors import CaptureError
 from reflfield.util.quoting import listed, quoted

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera, not_rigid_because
-from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.capture import Capture, usual_base_geometry
 from reflfield.capture.documents import check_counts, parse_count, parse_number, read_text
 from reflfield.capture.image_files import image_size
 from reflfield.capture.lights import LARGEST_COORDINATE, Light
 from reflfield.capture.names import frame_name, unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import CaptureError
 from reflfield.util.quoting import printable, quoted
 

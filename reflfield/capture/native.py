@@ -17,7 +17,7 @@ from jsonschema.exceptions import best_match
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.capture import Capture, usual_base_geometry
 from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.documents import LARGEST_COORDINATE, check_counts, read_json
 from reflfield.capture.image_files import ImageReading
@@ -25,6 +25,7 @@ from reflfield.capture.lenses import NAMES as LENS_KEYS
 from reflfield.capture.lights import Light
 from reflfield.capture.names import unique_names
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.capture.stated_readings import stated_reading
 from reflfield.errors import CaptureError
 from reflfield.util.quoting import has_controls, printable, quoted

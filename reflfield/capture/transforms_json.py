@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph, usual_base_geometry
+from reflfield.capture.capture import Capture, usual_base_geometry
 from reflfield.capture.documents import check_counts, number_array, read_json
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.names import IMAGE_SUFFIXES, unique_names
 from reflfield.capture.orientation import estimated_up
 from reflfield.capture.paths import NamedFiles
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.capture.stated_readings import READING_KEYS, stated_reading
 from reflfield.capture.transforms_camera import (
     CAMERA_KEYS,

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from reflfield.capture.capture import Capture, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.encoding import LINEAR, SRGB, Encoding
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.lights import ENVIRONMENT, Light
+from reflfield.capture.photographs import Photograph
 from reflfield.errors import InputError
 
 TABLE_NAME = "encoding"

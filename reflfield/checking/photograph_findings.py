@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.capture import Capture, Photograph
+from reflfield.capture.capture import Capture
+from reflfield.capture.photographs import Photograph
 from reflfield.checking.findings import ERROR, WARNING, Evidence, Finding, robust_spread
 from reflfield.checking.photograph_statistics import PhotographSet
 from reflfield.checking.shading_fit import Shading

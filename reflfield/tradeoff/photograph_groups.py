@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.capture import Capture, Photograph
+from reflfield.capture.capture import Capture
+from reflfield.capture.photographs import Photograph
 from reflfield.errors import InputError
 from reflfield.options import HoldOut
 from reflfield.pipeline.hold_out import counted, split_of

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import MEASURED, TRANSPARENT
 from reflfield.capture.encoding import decode_srgb, encode_srgb
 from reflfield.capture.image_files import read_alpha, read_image, read_kinds
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.inspect import describe
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import CaptureError
 from tests.capture.tiff_files import strips_of, tags_of, write_tiff
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import BLACK, MEASURED, SATURATED, TRANSPARENT, kinds_of_stored
 from reflfield.capture.encoding import encode_srgb
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure, Photograph
 
 SIZE = 40
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reflfield.capture.capture import Exposure
 from reflfield.capture.conversion import convert_capture
 from reflfield.capture.encoding import Encoding
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure
 from reflfield.capture.readers import open_capture
 from reflfield.errors import InputError
 from tests.capture.calibrations import assert_same_cameras, colmap_text, ring, write_photographs

@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.inspect import describe, largest_gap, object_centre
 from reflfield.capture.lights import Light
 from reflfield.capture.orientation import estimated_up
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.capture.readers import open_capture
 from reflfield.errors import CaptureError
 

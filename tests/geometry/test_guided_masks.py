@@ -7,10 +7,11 @@ import pytest
 
 from reflfield.api.masks import SCORES, make_masks, parse_colour
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.image_files import read_coverage
 from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError, ShapeError
 from reflfield.geometry import guided_masks as guided_masks_module
 from reflfield.geometry.guided_masks import (

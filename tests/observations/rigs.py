@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.capture import Capture, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Photograph
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import create_samples
 from reflfield.observations.texel_samples import TexelSamples, TransformedSamples

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera, looking_at
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.image_writing import write_exr, write_png
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError, ShapeError
 from reflfield.observations import store
 from reflfield.observations.bilinear_sampling import sample_bilinear

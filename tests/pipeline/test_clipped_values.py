@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Photograph
 from reflfield.errors import InputError
 from reflfield.observations.image_projection import VALUE_KINDS, LookedInto, Projected
 from reflfield.pipeline.clipped_values import (

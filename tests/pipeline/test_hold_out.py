@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError
 from reflfield.options import HoldOut, parse_hold_out
 from reflfield.pipeline.hold_out import (

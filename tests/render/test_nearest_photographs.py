@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.image_writing import write_exr
 from reflfield.capture.lights import DirectionalLight, Light
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.render.nearest_photographs import NearestPhotographs, filled_from_nearest

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reflfield.capture.capture import Capture, Exposure, Photograph
+from reflfield.capture.capture import Capture
 from reflfield.capture.image_files import read_coverage, read_image
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError
 from reflfield.render.exposure import ExposureMeter
 from reflfield.render.relit_photographs import relight_photographs
