@@ -23,9 +23,9 @@ def with_colors_corrected(
 ) -> Capture:
     """The capture with photographs that a matrix was applied to, written as linear OpenEXR.
 
-    Bracketed exposures are merged, dark frames subtracted. A pixel that is saturated in one
-    channel counts as saturated in all, since the matrix mixes them; negative values become 0.
-    Silhouettes that come of alpha become files.
+    Bracketed exposures are merged, dark frames subtracted, gains applied. A pixel that is
+    saturated in one channel counts as saturated in all, since the matrix mixes them; negative
+    values become 0. Silhouettes that come of alpha become files.
 
     Parameters
     ----------
@@ -46,6 +46,7 @@ def with_colors_corrected(
             capture.photographs[i],
             exposures=(_corrected(capture, i, matrix, folder),),
             dark=None,  # it is subtracted
+            gain=None,  # it is applied
         )
         for i in indices
     )

@@ -121,11 +121,12 @@ def correct_lights(capture: Capture) -> LightCorrection:
     """
     if capture.base_geometry == PLANE:
         raise InputError("lights: expected silhouettes of an object, received a flat sample")
-    others = [light for light in capture.lights if light.kind != POINT]
+    others = [light for light in capture.lights if light.kind != POINT or not light.falls_off]
     if others:
         raise InputError(
-            f"lights: expected point lights, received {others[0].id!r} of type "
-            f"{others[0].kind!r}"
+            f"lights: expected point lights that fall off with the distance, received "
+            f"{others[0].id!r} of type {others[0].kind!r}"
+            f"{'' if others[0].falls_off else ' with a constant irradiance'}"
         )
     lit = _lit_points(capture)
     positions = np.array([light.position for light in capture.lights])

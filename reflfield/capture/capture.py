@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.digest_text import camera_text, dark_pieces, light_text
+from reflfield.capture.digest_text import camera_text, correction_pieces, light_text
 from reflfield.capture.image_files import ImageReading, read_coverage, stores_alpha
 from reflfield.capture.lights import UNKNOWN, Light
 from reflfield.capture.names import check_unique
@@ -329,7 +329,7 @@ class Capture:
                 for exposure in photograph.exposures:
                     yield f"{exposure.seconds} {exposure.reading}".encode()
                     yield of_file(exposure.path, CaptureError)
-                yield from dark_pieces(photograph.dark, of_file)
+                yield from correction_pieces(photograph, of_file)
 
     def _silhouette_sources(self, view: int, of_file: FileDigest) -> Iterator[bytes]:
         """Bytes that stand for the photographs that a silhouette is made from."""
@@ -337,7 +337,7 @@ class Capture:
         for i in self._with_alpha(view) if self.base_geometry == PLANE else of_view:
             for exposure in self.photographs[i].exposures:
                 yield str(exposure.reading).encode() + of_file(exposure.path, CaptureError)
-            yield from dark_pieces(self.photographs[i].dark, of_file)
+            yield from correction_pieces(self.photographs[i], of_file)
 
 
 def usual_base_geometry(n_views: int) -> str:

@@ -71,7 +71,7 @@ def _table(capture: Capture) -> list[str]:
         return []
     kinds = {light.kind for light in capture.lights}
     for light in capture.lights:
-        if light.kind not in _COLUMNS or len(kinds) > 1:
+        if light.kind not in _COLUMNS or len(kinds) > 1 or not light.falls_off:
             raise refuse_light(light, TARGET)
     return [
         ",".join(

@@ -133,6 +133,7 @@ def check_photographs(capture: Capture) -> None:
             size = image_size(exposure.path, exposure.reading)
             check_matches(exposure.path, camera, *size)
     check_dark_frames(capture)
+    _check_gains(capture)
     _check_orientations(capture)
     _check_files_once(capture)
     for camera, path in zip(capture.cameras, capture.silhouettes, strict=True):
@@ -175,6 +176,17 @@ def first_uses(capture: Capture) -> list[tuple[DarkFrame, int]]:
         if photograph.dark is not None:
             first.setdefault((photograph.dark, photograph.camera), index)
     return [(dark, index) for (dark, _), index in first.items()]
+
+
+def _check_gains(capture: Capture) -> None:
+    """Demand gains that cover the images of their cameras."""
+    checked: set[tuple[int, int]] = set()
+    for photograph in capture.photographs:
+        key = (id(photograph.gain), photograph.camera)
+        if photograph.gain is not None and key not in checked:
+            checked.add(key)
+            camera = capture.cameras[photograph.camera]
+            photograph.gain.check_covers(camera.width, camera.height, str(photograph.path))
 
 
 def check_environments(capture: Capture) -> None:

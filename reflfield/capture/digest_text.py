@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from reflfield.capture.cameras import Camera
-from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.lights import Light
+from reflfield.capture.photographs import Photograph
 from reflfield.errors import CaptureError
 
 
@@ -26,13 +26,17 @@ def light_text(light: Light) -> str:
     numbers += [light.intensity.tolist(), light.exponent, light.cone_angle, light.falloff_angle]
     numbers += [light.convention, light.world_from_environment.tolist()]
     numbers += [light_text(member) for member in light.members]
+    numbers += [] if light.falls_off else ["constant"]
     return f"{light.id} {light.kind} {numbers}"
 
 
-def dark_pieces(
-    dark: DarkFrame | None, of_file: Callable[[Path, type[CaptureError]], bytes]
+def correction_pieces(
+    photograph: Photograph, of_file: Callable[[Path, type[CaptureError]], bytes]
 ) -> Iterator[bytes]:
-    """Bytes that stand for a dark frame and how it is read; none where there is none."""
+    """Bytes that stand for dark frame and gain; none where there is neither."""
+    dark, gain = photograph.dark, photograph.gain
     if dark is not None:
         yield f"dark {dark.seconds} {dark.reading}".encode()
         yield of_file(dark.path, CaptureError)
+    if gain is not None:
+        yield repr(gain).encode()

@@ -149,7 +149,7 @@ def describe(capture: Capture, *, sample: int = DEFAULT_SAMPLE) -> CaptureSummar
         camera_spread=largest_gap(views, pole),
         light_spread=largest_gap(np.reshape(lights, (-1, 3)), pole),
         object_centre=centre,
-        details=(*capture.details, *_dark_details(capture)),
+        details=(*capture.details, *_dark_details(capture), *_gain_details(capture)),
     )
 
 
@@ -158,6 +158,11 @@ def _dark_details(capture: Capture) -> tuple[str, ...]:
     n = sum(p.dark is not None for p in capture.photographs)
     words = f"{len(dark)} dark frame{'s' * (len(dark) != 1)}, subtracted from {n} photographs"
     return (words,) if dark else ()
+
+
+def _gain_details(capture: Capture) -> tuple[str, ...]:
+    n = sum(p.gain is not None for p in capture.photographs)
+    return (f"gains, which {n} photographs are multiplied by",) if n else ()
 
 
 def object_centre(capture: Capture) -> NDArray[np.float64]:

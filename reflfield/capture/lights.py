@@ -63,7 +63,7 @@ class Light:
         Towards the light (directional) or along the beam (spot); normalised here.
     intensity : (3,) array_like
         Radiant intensity, W/sr per channel (point, spot), or irradiance of a facing
-        surface, W/m^2 per channel (directional).
+        surface, W/m^2 per channel (directional, and point that does not fall off).
     exponent : float
         Spot: intensity falls like ``cos(angle to the beam) ** exponent``.
     cone_angle, falloff_angle : float
@@ -77,6 +77,9 @@ class Light:
         Environment: rotation from the map's frame to the world.
     members : tuple of Light
         Group: the lights that are on together.
+    falls_off : bool
+        Point: whether the irradiance falls like 1/d^2. False where photographs are corrected
+        for the distance of the lamp: it is then the same everywhere, its direction is not.
 
     Raises
     ------
@@ -107,6 +110,7 @@ class Light:
     convention: str = "openexr"
     world_from_environment: Array = field(default_factory=lambda: np.eye(3))
     members: tuple[Light, ...] = ()
+    falls_off: bool = True
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -122,6 +126,11 @@ class Light:
                 f"received {self.intensity.tolist()}"
             )
         _check_spot(self)
+        if not self.falls_off and self.kind != POINT:
+            raise CaptureError(
+                f"light {self.id!r}: irradiance: expected a point light where it is constant, "
+                f"received one of type {self.kind!r}"
+            )
         if self.kind == ENVIRONMENT:
             _check_environment(self)
         if self.kind == GROUP and not self.members:
@@ -173,12 +182,13 @@ class Light:
         r"""Irradiance (n, 3) of surfaces at world points (n, 3) that face the light.
 
         :math:`E = I\,s(\theta) / d^2` for point and spot lights (`s` is the spot's falloff),
-        the given irradiance for directional ones, 1 for an unknown light. W/m^2.
+        the given irradiance for directional ones and for point lights that do not fall off,
+        1 for an unknown light. W/m^2.
         """
         world = self._points(points)
         if self.kind == UNKNOWN:
             return np.ones((len(world), 3))
-        if self.kind == DIRECTIONAL:
+        if self.kind == DIRECTIONAL or not self.falls_off:
             return np.tile(self.intensity, (len(world), 1))
         falloff = self._falloff(world) / self._distances(world) ** 2
         return falloff[:, None] * self.intensity

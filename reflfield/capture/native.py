@@ -20,6 +20,7 @@ from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
 from reflfield.capture.capture import Capture, usual_base_geometry
 from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.documents import LARGEST_COORDINATE, check_counts, read_json
+from reflfield.capture.gain_grids import GainGrid, gain_grid
 from reflfield.capture.image_files import ImageReading
 from reflfield.capture.lenses import NAMES as LENS_KEYS
 from reflfield.capture.lights import Light
@@ -194,8 +195,9 @@ def _camera(entry: Mapping[str, Any], description: Path) -> Camera:
 def _light(entry: Mapping[str, Any], files: NamedFiles) -> Light:
     """A light; the schema has checked which fields each type has."""
     fields = {key: value for key, value in entry.items() if key not in ("type", "irradiance")}
-    if entry["type"] == "directional":
+    if "irradiance" in entry:
         fields["intensity"] = entry["irradiance"]
+        fields["falls_off"] = entry["type"] == "directional"
     if entry["type"] == "environment":
         fields["file"] = files.path(entry["file"])
     if "cone_angle" in fields:
@@ -251,6 +253,7 @@ def _photographs(
     reading = stated_reading(document, files, str(files.description))
     exposures = [_exposures(entry, files, reading) for entry in listed]
     dark_frames = _dark_frames(document, listed, files, reading)
+    gains = _gains(document, listed, files.description)
     names = unique_names([e[0].path for e in exposures], files.root)
     return tuple(
         Photograph(
@@ -259,9 +262,10 @@ def _photographs(
             light=_known(light, entry["light"], "light", files),
             exposures=files_of_entry,
             dark=dark,
+            gain=gain,
         )
-        for name, entry, files_of_entry, dark in zip(
-            names, listed, exposures, dark_frames, strict=True
+        for name, entry, files_of_entry, dark, gain in zip(
+            names, listed, exposures, dark_frames, gains, strict=True
         )
     )
 
@@ -317,6 +321,26 @@ def _dark_frames(
             stated.get("seconds", 1.0),
             stated_reading(stated, files, where, reading),
         )
+
+
+def _gains(
+    document: Mapping[str, Any], listed: Sequence[Mapping[str, Any]], description: Path
+) -> Iterator[GainGrid | None]:
+    """Gain of each photograph: its own, its camera's, or that of all; each is read once."""
+    of_cameras = {camera["id"]: camera.get("gain") for camera in document["cameras"]}
+    grids: dict[int, GainGrid] = {}
+    for i, entry in enumerate(listed):
+        of_camera = of_cameras.get(entry["camera"])
+        stated = entry.get("gain") or of_camera or document.get("gain")
+        if not stated:
+            yield None
+            continue
+        if id(stated) not in grids:
+            where = f"photographs[{i}].gain" if "gain" in entry else "gain"
+            if "gain" not in entry and of_camera:
+                where = f"camera {entry['camera']!r}: gain"
+            grids[id(stated)] = gain_grid(stated, f"{description}: {where}")
+        yield grids[id(stated)]
 
 
 def _known(index: Mapping[str, int], id_: str, what: str, files: NamedFiles) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
+from reflfield.capture.gain_grids import GainGrid, gain_entry
 from reflfield.capture.lenses import NAMES as LENS_KEYS
 from reflfield.capture.lights import DIRECTIONAL, ENVIRONMENT, GROUP, POINT, SPOT, Light
 from reflfield.capture.native import FILE_NAME, FORMAT, VERSION
@@ -29,6 +30,7 @@ def native_description(capture: Capture, files: WrittenFiles) -> None:
     lights = _ids([light.id for light in capture.lights], "l")
     silhouettes = files.silhouettes(capture, "silhouettes")
     names = files.photographs(capture, "photographs")
+    of_cameras = _gains_of_cameras(capture)
     photographs = []
     for photograph, own in zip(capture.photographs, names, strict=True):
         first = photograph.exposures[0]
@@ -50,6 +52,8 @@ def native_description(capture: Capture, files: WrittenFiles) -> None:
             of_dark = {} if "file" in entry else {"seconds": dark.seconds}
             of_dark |= files.reading(dark.reading) if dark.reading != first.reading else {}
             entry["dark"] = {"file": files.dark_frame(dark.path), **of_dark}
+        if photograph.gain is not None and of_cameras[photograph.camera] is None:
+            entry["gain"] = gain_entry(photograph.gain)
         photographs.append(entry)
     document = {
         "format": FORMAT,
@@ -59,8 +63,9 @@ def native_description(capture: Capture, files: WrittenFiles) -> None:
         "up": capture.up.tolist(),
         "cameras": [
             camera_entry(camera, id_, silhouette)
-            for camera, id_, silhouette in zip(
-                capture.cameras, cameras, silhouettes, strict=True
+            | ({} if gain is None else {"gain": gain_entry(gain)})
+            for camera, id_, silhouette, gain in zip(
+                capture.cameras, cameras, silhouettes, of_cameras, strict=True
             )
         ],
         "lights": [
@@ -69,6 +74,14 @@ def native_description(capture: Capture, files: WrittenFiles) -> None:
         "photographs": photographs,
     }
     files.text(FILE_NAME, json.dumps(document, indent=1) + "\n")
+
+
+def _gains_of_cameras(capture: Capture) -> list[GainGrid | None]:
+    """The gain that all photographs of a camera have; None where they differ or have none."""
+    gains: list[set[GainGrid | None]] = [set() for _ in capture.cameras]
+    for photograph in capture.photographs:
+        gains[photograph.camera].add(photograph.gain)
+    return [next(iter(some)) if len(some) == 1 else None for some in gains]
 
 
 def _ids(ids: Sequence[str], letter: str) -> list[str]:
@@ -100,7 +113,8 @@ def _light(light: Light, id_: str, files: WrittenFiles) -> dict[str, Any]:
     if light.kind == DIRECTIONAL:
         entry |= {"direction": light.direction.tolist(), "irradiance": light.intensity.tolist()}
     if light.kind in (POINT, SPOT):
-        entry |= {"position": light.position.tolist(), "intensity": light.intensity.tolist()}
+        strength = "intensity" if light.falls_off else "irradiance"
+        entry |= {"position": light.position.tolist(), strength: light.intensity.tolist()}
     if light.kind == SPOT:
         entry |= {
             "direction": light.direction.tolist(), "exponent": light.exponent,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from reflfield.capture.clipping import kinds_of_bracket
 from reflfield.capture.dark_frames import DarkFrame
 from reflfield.capture.exposures import merge_exposures
+from reflfield.capture.gain_grids import GainGrid
 from reflfield.capture.image_files import (
     AS_STATED,
     ImageReading,
@@ -55,6 +56,8 @@ class Photograph:
         True where the capture's maker keeps the photograph for comparison.
     dark : DarkFrame, optional
         What the camera sees without any lamp: it is subtracted.
+    gain : GainGrid, optional
+        What the values are then multiplied by.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Photograph:
     exposures: tuple[Exposure, ...]
     is_test: bool = False
     dark: DarkFrame | None = None
+    gain: GainGrid | None = None
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -75,15 +79,27 @@ class Photograph:
         """The first file."""
         return self.exposures[0].path
 
+    @property
+    def is_one_file(self) -> bool:
+        """Whether its radiance is that of one file: nothing is merged, taken off or scaled."""
+        return len(self.exposures) == 1 and self.dark is None and self.gain is None
+
     def read(self) -> NDArray[np.float32]:
         """Linear radiance, (h, w, 3) float32; bracketed exposures are merged."""
-        if len(self.exposures) == 1 and self.dark is None:
+        if self.is_one_file:
             first = self.exposures[0]
             return read_image(first.path, first.reading) / np.float32(first.seconds)
         return self.read_kinds()[0]
 
     def read_kinds(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Radiance and which of its values are measurements (`Capture.read_kinds`)."""
+        image, kinds = self._read_lit()
+        if self.gain is not None:
+            image = self.gain.multiply(image, str(self.path))
+        return image, kinds
+
+    def _read_lit(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Radiance of the lamp alone, and kinds of its values, before the gain."""
         first = self.exposures[0]
         if len(self.exposures) == 1:
             read = read_described(first.path, first.reading)

@@ -86,7 +86,7 @@ def _light(light: Light, files: WrittenFiles) -> dict[str, Any]:
             raise refuse_light(light, FILE_NAME)
         name = files.environment(light)
         return {"environment": name, "environment_convention": light.convention}
-    if any(source.kind != POINT for source in light.sources):
+    if any(source.kind != POINT or not source.falls_off for source in light.sources):
         raise refuse_light(light, FILE_NAME)
     positions = [source.position.tolist() for source in light.sources]
     intensities = [source.intensity.tolist() for source in light.sources]

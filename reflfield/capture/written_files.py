@@ -114,8 +114,14 @@ def first_reading(photograph: Photograph, target: str) -> ImageReading:
     Raises
     ------
     InputError
-        If there are several exposures, or a dark frame, of which the target knows nothing.
+        If there are several exposures, a dark frame or a gain, of which the target knows
+        nothing.
     """
+    if photograph.gain is not None:
+        raise InputError(
+            f"photograph {photograph.name!r}: expected no gain, which {target} cannot say; "
+            "write it with `to='native'`"
+        )
     if photograph.dark is not None:
         raise InputError(
             f"photograph {photograph.name!r}: expected no dark frame, which {target} cannot "
@@ -133,6 +139,7 @@ def first_reading(photograph: Photograph, target: str) -> ImageReading:
 def refuse_light(light: Light, target: str) -> InputError:
     """The error of a light that the target cannot say."""
     words = "an environment map" if light.kind == ENVIRONMENT else f"one of kind {light.kind!r}"
+    words += "" if light.falls_off else " that does not fall off"
     return InputError(
         f"light {light.id!r}: expected a light that {target} can say, received {words}; write "
         "it with `to='native'`"

@@ -54,9 +54,9 @@ def dark_frame_findings(capture: Capture) -> tuple[list[Finding], Capture]:
 
 
 def _without_dark_frame(capture: Capture, index: int) -> Float32 | None:
-    """A small photograph from which nothing is subtracted; None if it cannot be read."""
+    """A small photograph as the camera saw it; None if it cannot be read."""
     try:
-        radiance = replace(capture.photographs[index], dark=None).read()
+        radiance = replace(capture.photographs[index], dark=None, gain=None).read()
     except InputError:
         return None
     return reduced(radiance, KEPT_PIXELS)

@@ -165,7 +165,7 @@ def _read(capture: Capture, index: int) -> tuple[PhotographStatistics, Float32] 
 def _decoded(capture: Capture, index: int) -> tuple[Float32, NDArray[np.uint8]]:
     """Radiance and kinds of values, of a large JPEG at reduced size."""
     photograph = capture.photographs[index]
-    if len(photograph.exposures) > 1 or photograph.dark is not None:
+    if not photograph.is_one_file:
         return capture.read_kinds(index)
     first = photograph.exposures[0]
     image, kinds = read_small_kinds(first.path, first.reading, longest=2 * MEAN_PIXELS)

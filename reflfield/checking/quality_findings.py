@@ -294,7 +294,8 @@ def vignetting_findings(shading: Shading, capture: Capture) -> Iterator[Finding]
             (),
             "points are darker away from the image's centre, by "
             f"{100 * (1 - np.exp(slope)):.0f} % in the corners",
-            "correct the photographs by one of an evenly lit surface (flat field)",
+            "correct the photographs by one of an evenly lit surface (flat field), or state "
+            "its reciprocal as 'gain' in capture.json",
         )
 
 

@@ -71,8 +71,11 @@ class Bookmark:
 
 def can_be_shown(camera: Camera, light: Light) -> bool:
     """Whether the page can draw what a camera sees under a light."""
-    kinds = {single.kind for single in light.sources}
-    return camera.keeps_lines_straight and kinds <= {POINT, DIRECTIONAL, UNKNOWN}
+    drawn = all(
+        source.falls_off and source.kind in (POINT, DIRECTIONAL, UNKNOWN)
+        for source in light.sources
+    )
+    return camera.keeps_lines_straight and drawn
 
 
 def write_object_page(

@@ -19,6 +19,16 @@ from tests.capture.test_photometric_sets import DIRECTIONS, dome, numbers
 
 EXAMPLES, MANY = 30, 2000
 NAMES = [f"a_l{i % 3}_{i}.png" for i in range(5)]
+GRID = {
+    "whiteBalance": {"r": 1, "g": 0.5, "b": 2}, "intensity": 1,
+    "spatialCalibration": {"width": 80, "height": 60, "rows": 2, "cols": 3,
+                           "intensity": [9, 4, 2, 5, 3, 1]},
+}  # fmt: skip
+# The documented form of relight's .dome.
+DOCUMENTED = {
+    "imageWidth": 80, "diameter": 500, "positions": (DIRECTIONS * 250).tolist(),
+    "lightsCalibration": [GRID] * 4,
+}  # fmt: skip
 PIECES = st.sampled_from([
     b"", b"\0", b"\xff" * 8, b"\0" * 8, b"\0\0\0\0\0\0\0\x80", b"nan", b"inf", b"1e308", b"-1",
     b"9" * 400, b"../../a.png", b"/etc/passwd", b"C:\\a.png", b"\n", b",", b"<", b"</a>",
@@ -45,6 +55,7 @@ def prepared(folder):
         "vset": ("a.vset", view_set(ring(), NAMES, extra="e 0.2 60|e 0.9 200")),
         "xml": ("a.xml", metashape(ring(), labels=NAMES)),
         "dome": ("a.dome", json.dumps(dome(lightConfiguration="lights3d"))),
+        "grids": ("a.dome", json.dumps(DOCUMENTED)),
         "list": ("light_directions.txt", lights),
         "csv": ("lights.csv", LAMPS),
         "txt": ("sparse/0/images.txt", None),
@@ -55,7 +66,7 @@ def prepared(folder):
     }
     for name, (file, text) in texts.items():
         root = folder / name
-        names = NAMES[:4] if name in ("dome", "list", "mat") else NAMES
+        names = NAMES[:4] if name in ("dome", "grids", "list", "mat") else NAMES
         write_photographs(root / ("previews" if name == "vset" else "images"), names)
         if text is not None:
             (root / file).write_text(text)
@@ -89,7 +100,7 @@ def fuzzed(examples):
     )
 
 
-FORMATS = ["vset", "xml", "dome", "list", "csv", "txt", "bin", "lens", "npy", "mat"]
+FORMATS = ["vset", "xml", "dome", "grids", "list", "csv", "txt", "bin", "lens", "npy", "mat"]
 
 
 def opens_or_is_refused(capture, changes):

@@ -183,7 +183,8 @@ def test_relight_dome(tmp_path, kind, rounding):
         ({"directions": [{"x": 1}]}, r"directions\[0\]: expected 3 numbers"),
         ({"directions": [[0, 0, 0]]}, "photographs|not zero"),
         ({"ledAdjust": [{"r": 1, "g": 0.5, "b": 1}]}, r"ledAdjust\[0\]: expected 1"),
-        ({"lightsCalibration": {}}, "lightsCalibration: expected the keys"),
+        ({"lampHeight": 3}, "lampHeight: expected the keys"),
+        ({"ledAdjust": 5}, "ledAdjust: expected a list"),
         ({"lightConfiguration": "lights3d", "imageWidth": 0}, "imageWidth: expected the width"),
     ],
 )
