@@ -114,7 +114,7 @@ def correct_lights(capture: Capture) -> LightCorrection:
     Raises
     ------
     InputError
-        If the capture is flat, or has other than point lights, or the object does not show
+        If the capture is flat, or has lights that are no points or do not fall off, or the object does not show
         enough points lit well by several lights.
     GeometryError
         If the silhouettes have no common hull.
@@ -124,8 +124,8 @@ def correct_lights(capture: Capture) -> LightCorrection:
     others = [light for light in capture.lights if light.kind != POINT or not light.falls_off]
     if others:
         raise InputError(
-            f"lights: expected point lights that fall off with the distance, received "
-            f"{others[0].id!r} of type {others[0].kind!r}"
+            f"lights: expected point lights, received {others[0].id!r} of type "
+            f"{others[0].kind!r}"
             f"{'' if others[0].falls_off else ' with a constant irradiance'}"
         )
     lit = _lit_points(capture)

@@ -80,3 +80,6 @@ def test_distant_lights_are_refused(dome):
     distant = DirectionalLight([0, 0, 1], id="sun")
     with pytest.raises(InputError, match="expected point lights, received 'sun'"):
         correct_lights(replace(dome, lights=(distant, *dome.lights[1:])))
+    even = replace(dome.lights[0], falls_off=False)
+    with pytest.raises(InputError, match="of type 'point' with a constant irradiance"):
+        correct_lights(replace(dome, lights=(even, *dome.lights[1:])))

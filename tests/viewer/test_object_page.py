@@ -202,6 +202,7 @@ class TestText:
     def test_lenses_that_bend_lines_and_maps_cannot_be_shown(self):
         camera = rf.Camera.look_at([0, 0, 2])
         assert can_be_shown(camera, rf.PointLight([0, 0, 2]))
+        assert not can_be_shown(camera, rf.Light("even", "point", falls_off=False))
         spot = rf.Light("s", "spot", position=[0, 0, 2], direction=[0, 0, -1])
         assert not can_be_shown(camera, spot)
         bent = rf.Camera("b", "opencv", 9, 9, 9, 9, 4, 4, np.eye(4), (0.1,))
