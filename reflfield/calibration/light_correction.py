@@ -114,8 +114,8 @@ def correct_lights(capture: Capture) -> LightCorrection:
     Raises
     ------
     InputError
-        If the capture is flat, or has lights that are no points or do not fall off, or the object does not show
-        enough points lit well by several lights.
+        If the capture is flat, or has lights that are no points or do not fall off, or the
+        object does not show enough points lit well by several lights.
     GeometryError
         If the silhouettes have no common hull.
     """
