@@ -13,7 +13,7 @@ the web", Graphical Models 2019.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,8 @@ Doubles = NDArray[np.float64]
 
 # Lights along a side of the grid, principal components, and the most pixels along a side.
 GRID_SIDE, N_PLANES, MOST_SIDE = 12, 27, 512
-_QUALITY = 95
+# Of JPEG. Planes are many, normals one image that is read as numbers.
+_QUALITY, _NORMALS_QUALITY = 95, 100
 _WHITE_PERCENTILE = 99.5
 # Pixels that principal components are made from.
 _MOST_PIXELS = 20_000
@@ -127,14 +128,16 @@ def write_rti(path: Path, field: ReflectanceField, view: ArrayLike | None = None
     planes = image_planes(images.reshape(-1, *images.shape[2:]))
     normals = _normals(surface, camera)
     with filling(path) as partial:
-        _write_planes(partial, planes, (camera.height, camera.width))
-        _write_jpeg(partial / "normals.jpg", np.rint(127.5 * (normals + 1.0)).astype(np.uint8))
+        stored = _write_planes(partial, planes, (camera.height, camera.width))
+        encoded = np.rint(127.5 * (normals + 1.0)).astype(np.uint8)
+        _write_jpeg(partial / "normals.jpg", encoded, _NORMALS_QUALITY)
         write_exr(partial / "normals.exr", normals, ["normal.X", "normal.Y", "normal.Z"])
-    off = planes.decoded() - images.reshape(planes.decoded().shape)
+    shown = stored.decoded()
+    off = shown - images.reshape(shown.shape)
     quality = -10.0 * np.log10(max(float(np.mean(off**2)), 1e-12))
     return [
         f"planes: {camera.width} x {camera.height} pixels, {len(planes.ranges)} components of "
-        f"{GRID_SIDE**2} lights, {quality:.1f} dB against the field's images before JPEG; "
+        f"{GRID_SIDE**2} lights, {quality:.1f} dB against the field's images under them; "
         f"white is a radiance of {white:.4g} under an irradiance of pi"
     ]
 
@@ -209,7 +212,8 @@ def image_planes(images: Floats, n_planes: int = N_PLANES) -> ImagePlanes:
     return ImagePlanes(basis, ranges, scale, -low / scale, planes)
 
 
-def _write_planes(folder: Path, planes: ImagePlanes, shape: tuple[int, int]) -> None:
+def _write_planes(folder: Path, planes: ImagePlanes, shape: tuple[int, int]) -> ImagePlanes:
+    """Write ``info.json`` and the planes; returns them as a viewer reads them."""
     n_planes = len(planes.ranges)
     material = {
         "scale": planes.scale.tolist(),
@@ -229,18 +233,23 @@ def _write_planes(folder: Path, planes: ImagePlanes, shape: tuple[int, int]) -> 
         "basis": planes.basis.ravel().tolist(),
     }
     (folder / "info.json").write_text(json.dumps(info), encoding="utf-8")
+    read = []
     for number in range(n_planes // 3):
         image = planes.planes[:, 3 * number : 3 * number + 3].reshape(*shape, 3)
-        _write_jpeg(folder / f"plane_{number}.jpg", image)
+        read.append(_write_jpeg(folder / f"plane_{number}.jpg", image, _QUALITY))
+    return replace(planes, planes=np.concatenate(read, axis=2).reshape(-1, n_planes))
 
 
-def _write_jpeg(path: Path, image: NDArray[np.uint8]) -> None:
+def _write_jpeg(path: Path, image: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    """Write three channels, none at a loss for the others; returns them as they are read."""
     stream = BytesIO()
-    # Planes are no colours: none of them may lose its resolution.
+    # Coefficients and normals are no colours: as luminance and chroma, two of three channels
+    # would be quantised more coarsely.
     Image.fromarray(np.ascontiguousarray(image)).save(
-        stream, format="JPEG", quality=_QUALITY, subsampling=0
+        stream, format="JPEG", quality=quality, subsampling=0, keep_rgb=True
     )
     path.write_bytes(stream.getvalue())
+    return np.asarray(Image.open(stream))
 
 
 def _normals(surface: FieldSurface, camera: Camera) -> Floats:
