@@ -38,8 +38,9 @@ from reflfield.util.validation import unit_direction
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-# Lights along a side of the grid, principal components, and the most pixels along a side.
-GRID_SIDE, N_PLANES, MOST_SIDE = 12, 27, 512
+# Lights along a side of the grid, principal components, and the most pixels along a side. The
+# side is odd: light from the viewer, which viewers begin with, is one of the lights.
+GRID_SIDE, N_PLANES, MOST_SIDE = 13, 27, 512
 # Of JPEG. Planes are many, normals one image that is read as numbers.
 _QUALITY, _NORMALS_QUALITY = 95, 100
 _WHITE_PERCENTILE = 99.5
