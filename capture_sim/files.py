@@ -114,8 +114,8 @@ def write_png(path: Path, encoded: NDArray[np.uint8]) -> None:
     Parameters
     ----------
     path : Path
-    encoded : (h, w) or (h, w, 3) uint8
-        Grey or sRGB.
+    encoded : (h, w), (h, w, 3) or (h, w, 4) uint8
+        Grey or sRGB, with alpha that nothing is multiplied by.
     """
     Image.fromarray(encoded).save(path, format="PNG")
 

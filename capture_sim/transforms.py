@@ -1,9 +1,13 @@
 """A capture once more as radiance-field software reads it: ``transforms/`` in its folder.
 
-``transforms_train.json`` and ``transforms_test.json`` list OpenEXR images of radiance over
-black with the coverage as alpha, one light each (``pl_pos``, ``pl_intensity``), as NRHints and
-GS3 take them. The test split is that of the held-out photographs; where the scene has none, it
-is every eighth photograph.
+``transforms_train.json`` and ``transforms_test.json`` list images, one light each (``pl_pos``,
+``pl_intensity``), as NRHints and GS3 take them; ``transforms_val.json``, which NRHints asks
+for, lists none. The test split is that of the held-out photographs; where the scene has none,
+it is every eighth photograph.
+
+Each image is there twice. ``NAME.exr`` is radiance over black, ``NAME.png`` is sRGB-encoded and
+not multiplied by alpha, 1 being a radiance of ``png_white``; alpha is the coverage. Frames name
+neither: the others read PNG if not told otherwise, reflfield OpenEXR.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from PIL import Image
 
 from capture_sim.effects import exposure_brackets, simulated
 from capture_sim.errors import scene_error
-from capture_sim.files import write_json, write_rgba_exr, write_whole
+from capture_sim.files import write_json, write_png, write_rgba_exr, write_whole
 from capture_sim.heldout import heldout_pairs, point_light, transforms_frame
 from capture_sim.model import Scene
 from capture_sim.photograph import Setup
@@ -28,6 +32,7 @@ Table = Mapping[str, Any]
 
 FOLDER = "transforms"
 TEST_STEP = 8  # one photograph of so many is a test where none is held out
+WHITE_PERCENT = 99.0  # of an object's values, which are not brighter than white
 
 
 class SplitImage(NamedTuple):
@@ -70,7 +75,7 @@ def check_transforms(scene: Scene) -> None:
 
 
 def write_transforms(setup: Setup, folder: Path) -> None:
-    """Write both splits from a capture's photographs, silhouettes and held-out photographs.
+    """Write the splits from a capture's photographs, silhouettes and held-out photographs.
 
     Parameters
     ----------
@@ -83,11 +88,19 @@ def write_transforms(setup: Setup, folder: Path) -> None:
     test = _held_out(setup.scene)
     if not test:
         train, test = [o for i, o in enumerate(train) if i % TEST_STEP], train[::TEST_STEP]
-    for name, images in (("train", train), ("test", test)):
-        (folder / FOLDER / name).mkdir(parents=True, exist_ok=True)
-        frames = [_write_frame(image, name, setup.scene, folder) for image in images]
+    white = max((_white(*_read(folder, image)) for image in [*train, *test]), default=0) or 1.0
+    common = {
+        "camera_model": "OPENCV",
+        # Of one camera: loaders ask for them here, and read a frame's own, if at all, later.
+        "camera_intrinsics": _intrinsics((train or test)[0].camera),
+        "png_white": white,
+    }
+    for name, images in (("train", train), ("val", []), ("test", test)):
+        if images:
+            (folder / FOLDER / name).mkdir(parents=True)
+        frames = [_write_frame(image, name, setup.scene, folder, white) for image in images]
         file = folder / FOLDER / f"transforms_{name}.json"
-        write_whole(file, write_json, {"camera_model": "OPENCV", "frames": frames})
+        write_whole(file, write_json, {**common, "frames": frames})
 
 
 def _photographs(setup: Setup) -> list[SplitImage]:
@@ -115,24 +128,46 @@ def _held_out(scene: Scene) -> list[SplitImage]:
     ]
 
 
-def _write_frame(image: SplitImage, split: str, scene: Scene, folder: Path) -> dict[str, Any]:
-    """Write one image; returns its frame."""
+def _write_frame(
+    image: SplitImage, split: str, scene: Scene, folder: Path, white: float
+) -> dict[str, Any]:
+    """Write one image, as EXR and PNG; returns its frame."""
     stem = f"{split}/{Path(image.photograph).stem}"
-    radiance, coverage = _read(folder / image.photograph, folder / image.silhouette)
+    radiance, coverage = _read(folder, image)
     pixels = np.concatenate([radiance, coverage[..., None].astype(radiance.dtype)], axis=2)
     write_whole(folder / FOLDER / f"{stem}.exr", write_rgba_exr, pixels)
+    write_whole(folder / FOLDER / f"{stem}.png", write_png, _encoded(radiance, coverage, white))
     light = point_light(image.light, scene.mesh.centre)
     frame = transforms_frame(image.camera, light, stem, "")
     del frame["mask_path"]  # the alpha channel
-    intrinsics = [image.camera[key] for key in ("cx", "cy", "fl_x", "fl_y")]
-    return {**frame, "file_ext": ".exr", "camera_intrinsics": intrinsics}
+    return {**frame, "camera_intrinsics": _intrinsics(image.camera)}
 
 
-def _read(photograph: Path, silhouette: Path) -> tuple[NDArray[Any], NDArray[np.float32]]:
+def _intrinsics(camera: Table) -> list[float]:
+    return [camera[key] for key in ("cx", "cy", "fl_x", "fl_y")]
+
+
+def _white(radiance: NDArray[Any], coverage: NDArray[np.float32]) -> float:
+    """Radiance that an image shows as white: few highlights of the object are brighter."""
+    covered = radiance[coverage == 1].astype(np.float64)
+    return float(np.percentile(covered, WHITE_PERCENT)) if covered.size else 0.0
+
+
+def _encoded(
+    radiance: NDArray[Any], coverage: NDArray[np.float32], white: float
+) -> NDArray[np.uint8]:
+    """RGBA of 8 bits, sRGB, not multiplied by alpha: readers multiply."""
+    straight = radiance / np.where(coverage > 0, coverage, 1.0)[..., None]
+    colour = exposure_brackets.apply((straight / white).astype(np.float32))
+    alpha = np.rint(255.0 * coverage).astype(np.uint8)
+    return np.concatenate([colour, alpha[..., None]], axis=2)
+
+
+def _read(folder: Path, image: SplitImage) -> tuple[NDArray[Any], NDArray[np.float32]]:
     """Radiance and coverage of files that this program wrote."""
-    with OpenEXR.File(str(photograph)) as file:
+    with OpenEXR.File(str(folder / image.photograph)) as file:
         radiance = file.channels()["RGB"].pixels
-    with Image.open(silhouette) as opened:
+    with Image.open(folder / image.silhouette) as opened:
         coverage = np.asarray(opened, np.float32) / 255.0
     return radiance, coverage
 

@@ -29,6 +29,7 @@ _READ = {
 _WITHOUT_EFFECT = {
     "aabb", "aabb_scale", "render_aabb", "ply_file_path", "depth_file_path", "depth_path",
     "colmap_im_id", "sharpness", "rotation", "camera_near", "camera_far", "n_frames",
+    "png_white",
     # Done to the poses before they were written.
     "applied_transform", "applied_scale",
 }  # fmt: skip

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 from capture_sim.errors import SceneError
 from capture_sim.write import write_capture
@@ -23,6 +24,8 @@ def both(tmp_path_factory):
 
 def test_cameras_lights_and_values_are_those_of_the_native_capture(both, rounding):
     native, transforms = both
+    assert not any("png_white" in note for note in transforms.notes)
+    assert all(one.path.suffix == ".exr" for one in transforms.photographs)
     train = [one for one in transforms.photographs if not one.is_test]
     assert len(train) == len(native.photographs) == 9
     for index, (one, other) in enumerate(zip(train, native.photographs, strict=True)):
@@ -52,9 +55,11 @@ def test_held_out_frames_are_the_test_split(both):
 
 
 def test_a_loader_of_the_others_gets_what_it_asks_for(both):
-    """GS3: ``file_path`` without the suffix, centre before focal lengths, four channels."""
+    """``file_path`` without a suffix, centre before focal lengths, three splits."""
     folder = both[1].root
     document = json.loads((folder / "transforms_train.json").read_text())
+    assert document["camera_intrinsics"] == document["frames"][0]["camera_intrinsics"]
+    assert json.loads((folder / "transforms_val.json").read_text())["frames"] == []
     for frame in document["frames"]:
         cx, cy, fx, fy = frame["camera_intrinsics"]
         assert (cx, cy, fx, fy) == tuple(frame[k] for k in ("cx", "cy", "fl_x", "fl_y"))
@@ -62,6 +67,8 @@ def test_a_loader_of_the_others_gets_what_it_asks_for(both):
             pixels = file.channels()["RGBA"].pixels
         assert pixels.shape == (20, 24, 4)
         assert pixels[..., 3].max() == 1
+        with Image.open(folder / f"{frame['file_path']}.png") as opened:
+            assert (opened.mode, opened.size) == ("RGBA", (24, 20))
         assert len(frame["pl_pos"]) == len(frame["pl_intensity"]) == 3
 
 

@@ -86,7 +86,7 @@ def test_the_viewer_shows_what_the_field_does(glossy, tmp_path):
     for one in off:
         # Lights of the grid are 15 degrees apart: values between them are interpolated.
         assert np.sqrt(np.mean(one**2)) < 0.03
-    # Light from the viewer is of the grid, not between four of it: observed 0.0017, 0.0067 else.
+    # Light from the viewer is one of the grid: observed 0.0017, and 0.0067 between four.
     assert np.sqrt(np.mean(off[0] ** 2)) < 0.003
 
 
