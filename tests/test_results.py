@@ -239,7 +239,7 @@ def test_fits_are_joined_from_the_papers_to_the_default(monkeypatch):
     rows = [
         {"capture": "vase", "images": images, "method": m, "PSNR, dB": 1.0, "CPU time, s": 1.0}
         for images in ("unseen", "held out")
-        for m in ("default", "paper", "clusters, not aligned", "clusters")
+        for m in ("default", "paper", "clusters, not aligned", "clusters, samples")
     ]
     seen = {}
     monkeypatch.setattr(
@@ -248,4 +248,4 @@ def test_fits_are_joined_from_the_papers_to_the_default(monkeypatch):
         lambda series, *_, **words: seen.update(series),
     )
     error_against_time.fit_picture([{"rows": rows}])
-    assert [mark.label for mark in seen["vase"]] == ["paper", "clusters", "default"]
+    assert [mark.label for mark in seen["vase"]] == ["paper", "clusters, samples", "default"]

@@ -3,14 +3,16 @@
     python tests/benchmarks/bench_methods.py                        # all captures that are here
     python tests/benchmarks/bench_methods.py vase dinoSparseRing --out DIR
 
-"default" is what ``reflfield run`` makes. "clusters" are clustered local PCA fitted to
-samples in aligned frames; "clusters, not aligned" the same in the frames of the atlas, with as
-many bytes. "half vector, samples" is the half-vector model fitted to samples of the hull alone,
-"half vector, photographs" to the photographs on the hull; the default moves the hull to the
+"default" is what ``reflfield run`` makes. "clusters, samples" are clustered local PCA fitted
+to samples in aligned frames, "clusters, grid" to the resampled grid alone, "clusters" to what
+is selected; "clusters, not aligned" are those to samples in the frames of the atlas, with as
+many bytes. "half vector, samples" is the half-vector model fitted to samples of the hull
+alone, "half vector, images" to the photographs on the hull; the default moves the hull to the
 normals besides. "paper" is the pipeline of Müller, Sarlette and Klein 2006: samples resampled
 onto a grid, completed and aligned, and local PCA of 16 clusters with 10 components, fitted to
 the grid alone. All are compared with the same held-out photographs, and with those of views
-and lights that are not in the capture where it has some. Times are of stages that fields need.
+and lights that are not in the capture where it has some. CPU time and peak memory are those of
+the stages that a field needs.
 
 Writes results/methods.json.
 """
@@ -39,31 +41,39 @@ from benchmarks.measuring import Results
 
 NAMES = ("vase", "mitsuba_spot", "rti_loewenkopf", "dinoSparseRing")
 CLUSTERED = ("--set", "compression.model=clustered")
+SAMPLES, GRID = ("--set", "compression.fit=samples"), ("--set", "compression.fit=grid")
 PAPER = (
     *CLUSTERED,
-    *("--set", "compression.fit=grid"),
+    *GRID,
     *("--set", "compression.n_clusters=16", "--set", "compression.n_components=10"),
     *("--set", "alignment.refine=false"),
 )
+HALF_VECTOR = ("--set", "compression.model=half_vector")
 # Of `reflfield run` besides those of the capture, and which of its fields the rows are about.
 METHODS = {
     "default": ((), {"field": "default"}),
+    "paper": (PAPER, {"field": "paper"}),
+}
+OTHER_METHODS = {
     "clusters": (
         (*CLUSTERED, *SECOND_FIELD),
         {"field": "clusters", "without_alignment": "clusters, not aligned"},
     ),
-    "paper": (PAPER, {"field": "paper"}),
 }
-HALF_VECTOR = ("--set", "compression.model=half_vector")
-# Of solid objects under known lights, besides: what the default does, less of it.
-HALF_VECTOR_METHODS = {
+# Of solid objects under known lights. Of the half-vector model: what the default does, in part.
+SOLID_METHODS = {
+    "clusters, grid": ((*CLUSTERED, *GRID), {"field": "clusters, grid"}),
+    "clusters, samples": (
+        (*CLUSTERED, *SAMPLES, *SECOND_FIELD),
+        {"field": "clusters, samples", "without_alignment": "clusters, not aligned"},
+    ),
     "samples": (
         (*HALF_VECTOR, "--set", "compression.half_vector.image_steps=0"),
         {"field": "half vector, samples"},
     ),
-    "photographs": (
+    "images": (
         (*HALF_VECTOR, "--set", "compression.half_vector.surface_from_normals=false"),
-        {"field": "half vector, photographs"},
+        {"field": "half vector, images"},
     ),
 }
 SOLID = ("vase", "mitsuba_spot")
@@ -75,7 +85,7 @@ def measure(results, name, folder):
     folder.mkdir(parents=True)
     out, log = folder / "out", folder / "log.txt"
     capture = capture_of(benchmark, folder, log)
-    methods = METHODS | (HALF_VECTOR_METHODS if name in SOLID else {})
+    methods = METHODS | (SOLID_METHODS if name in SOLID else OTHER_METHODS)
     for options, fields in methods.values():
         ran("reflfield", ("run", capture, "-o", out, *benchmark.words, *options), log)
         stages = json.loads((out / "timings.json").read_text())["stages"]
@@ -94,7 +104,7 @@ def add_row(results, name, method, stages_folder, field, stages):
         path = stages_folder / "comparison" / field / f"{kind}.json"
         if path.is_file():
             mean = json.loads(path.read_text())["mean"]
-            add(results, name, method, images, mean, size, cpu_seconds(stages, left_out))
+            add(results, (name, images, method), mean, size, needed(stages, left_out))
 
 
 def add_frames(results, name, method, out, capture, folder, log):
@@ -103,28 +113,27 @@ def add_frames(results, name, method, out, capture, folder, log):
     compared = compare(out, capture / frames, folder / method, log)
     size = (out / "field.rfld").stat().st_size
     stages = json.loads((out / "timings.json").read_text())["stages"]
-    seconds = cpu_seconds(stages, "without_alignment")
-    add(results, name, method, what, compared["mean"], size, seconds)
+    spent = needed(stages, "without_alignment")
+    add(results, (name, what, method), compared["mean"], size, spent)
 
 
-def cpu_seconds(stages, left_out):
-    """CPU time of the stages up to the field, but for that of the other field."""
+def needed(stages, left_out):
+    """Stages up to the field, but for that of the other field."""
     others = {left_out, "maps", "comparison", "error_analysis", "web_page", "report"}
-    return sum(stage["cpu_seconds"] for stage in stages if stage["name"] not in others)
+    return [stage for stage in stages if stage["name"] not in others]
 
 
-def add(results, name, method, images, mean, size, seconds):
+def add(results, names, mean, size, stages):
     """One row of the table."""
     results.add(
-        {
-            "capture": name,
-            "images": images,
-            "method": method,
+        dict(zip(("capture", "images", "method"), names, strict=True))
+        | {
             "PSNR, dB": round(mean["psnr_ldr"], 2),
             "SSIM": round(mean["ssim"], 4),
             "FLIP": round(mean["flip"], 4),
             "field, kB": round(size / 1000, 1),
-            "CPU time, s": round(seconds, 1),
+            "CPU time, s": round(sum(stage["cpu_seconds"] for stage in stages), 1),
+            "peak memory, GB": round(max(s["peak_bytes"] for s in stages) / 2**30, 2),
         }
     )
     print(results.tables[-1]["rows"][-1], flush=True)
@@ -138,11 +147,12 @@ def main():
     options = parser.parse_args()
     if unknown := set(options.names) - set(NAMES):
         parser.error(f"NAME: expected {', '.join(NAMES)}, received {', '.join(unknown)}")
-    results = Results("methods", "Methods on four captures", MEASURED)
-    results.table("Images, size and time")
+    names = options.names or NAMES
+    results = Results("methods", f"Methods on {len(names)} captures", MEASURED)
+    results.table("Images, size, time and memory")
     with ExitStack() as stack:
         out = options.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        for name in options.names or NAMES:
+        for name in names:
             why = missing(name)
             if why is None:
                 measure(results, name, out / name)

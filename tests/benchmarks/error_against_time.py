@@ -13,9 +13,10 @@ CPU = "CPU time, s"
 # Rows of `bench_methods.py` in the order in which they are joined: each does more.
 FITS = (
     "paper",
-    "clusters",
+    "clusters, grid",
+    "clusters, samples",
     "half vector, samples",
-    "half vector, photographs",
+    "half vector, images",
     "default",
 )
 COMPLETIONS = "completion, hemispheric"
