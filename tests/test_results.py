@@ -234,18 +234,31 @@ def test_pictures_show_error_against_time_for_what_was_measured():
     assert error_against_time.pictures(none) == {}
 
 
-def test_fits_are_joined_from_the_papers_to_the_default(monkeypatch):
+def test_fits_are_joined_from_the_papers_to_the_default():
     """An order by time would join a slow poor method to a fast good one."""
     rows = [
         {"capture": "vase", "images": images, "method": m, "PSNR, dB": 1.0, "CPU time, s": 1.0}
         for images in ("unseen", "held out")
-        for m in ("default", "paper", "clusters, not aligned", "clusters, samples")
+        for m in ("default", "half vector, samples", "clusters, not aligned", "paper")
     ]
-    seen = {}
-    monkeypatch.setattr(
-        error_against_time.plots,
-        "marked_curves",
-        lambda series, *_, **words: seen.update(series),
-    )
-    error_against_time.fit_picture([{"rows": rows}])
-    assert [mark.label for mark in seen["vase"]] == ["paper", "clusters, samples", "default"]
+    curves = error_against_time.fit_curves(rows)
+    assert {images for _, images in curves} == {"unseen views and lights", "held out"}
+    for points in curves.values():
+        assert [m for m, *_ in points] == ["paper", "half vector, samples", "default"]
+    assert b"<svg" in error_against_time.fit_picture([{"rows": rows}])
+    others = [row for row in rows if row["method"] == "default"]
+    assert error_against_time.fit_picture([{"rows": others}]) is None
+
+
+def test_searches_are_drawn_for_each_band_limit():
+    rows = [
+        {"L": limit, "search": search, "K or rounds": "4", "ms per texel": 1.0 + limit}
+        | {"normals": 1.0, "tangents": 2.0, "remark": "the default"}
+        for limit in (4, 8)
+        for search in error_against_time.SEARCHES
+    ]
+    tables = [{"title": "", "rows": rows}]
+    drawn = error_against_time.pictures([{"name": "accuracy", "tables": tables}])
+    assert drawn == error_against_time.pictures([{"name": "accuracy", "tables": tables}])
+    assert list(drawn) == ["accuracy.svg"]
+    assert error_against_time.alignment_picture(tables, "png").startswith(b"\x89PNG")

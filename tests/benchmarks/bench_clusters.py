@@ -12,7 +12,6 @@ read, so that memory shows what the alignment itself holds.
 from __future__ import annotations
 
 import argparse
-import resource
 import sys
 import time
 from pathlib import Path
@@ -21,7 +20,7 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 import numpy as np  # noqa: E402
-from benchmarks.measuring import Results  # noqa: E402
+from benchmarks.measuring import Results, spent  # noqa: E402
 from scipy.optimize import linear_sum_assignment  # noqa: E402
 
 from reflfield.alignment import align  # noqa: E402
@@ -76,32 +75,27 @@ def compare(name, materials, options, results):
     """One line: labels and normals together, and normals of each material alone."""
     rng = np.random.default_rng(3)
     samples, d, frames, label = mixture(materials, options.texels, options.noise, rng)
-    start = time.perf_counter(), time.process_time()
-    alignment = align(samples, d, d, n_clusters=len(materials), n_threads=options.threads)
-    wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
+    alignment, cost = spent(
+        lambda: align(samples, d, d, n_clusters=len(materials), n_threads=options.threads)
+    )
     together = frame_errors(alignment.local_from_base, frames)[0]
     alone = np.zeros(len(frames))
     for k in range(len(materials)):
         mine = label == k
         single = align(samples[mine], d, d, n_threads=options.threads)
         alone[mine] = frame_errors(single.local_from_base, frames[mine])[0]
-    print(
-        f"{name:15s} labels {100 * agreement(alignment.cluster, label):6.2f} %   normals mean "
-        f"{together.mean():.3f} (alone {alone.mean():.3f}) 95 % "
-        f"{np.percentile(together, 95):.3f} (alone {np.percentile(alone, 95):.3f})   "
-        f"{wall:.0f} s ({cpu:.0f} s of processors)",
-        flush=True,
-    )
     results.add(
         {
             "materials": name,
             "labels right, %": 100 * agreement(alignment.cluster, label),
             "normals, mean degrees": together.mean(),
+            "95 %": np.percentile(together, 95),
             "each alone": alone.mean(),
-            "wall time, s": wall,
-            "CPU time, s": cpu,
+            "alone, 95 %": np.percentile(alone, 95),
+            **cost,
         }
     )
+    results.say()
 
 
 class Made:
@@ -111,6 +105,7 @@ class Made:
         self.directions, every = dome_directions(), relief_frames()
         self.frames = every[np.arange(n) % len(every)]
         self.shape = (n, len(self.directions), len(self.directions))
+        self.label = np.arange(n) % 16
         self.wall = self.cpu = 0.0
 
     def read(self, rows):
@@ -118,7 +113,7 @@ class Made:
         start = time.perf_counter(), time.process_time()
         out = np.zeros((len(rows), *self.shape[1:]), np.float32)
         for k in range(16):
-            mine = rows % 16 == k
+            mine = self.label[rows] == k
             material = {"nu": 4.0 * 2 ** (k % 4), "nv": 8.0 * 3 ** (k // 4)}
             d = self.directions
             out[mine] = sample_texels(self.frames[rows[mine]], d, d, **material)
@@ -133,24 +128,24 @@ def large(n, options, results):
     d = source.directions
     for refine in (False, True) if options.refined else (False,):
         source.wall, source.cpu = 0.0, 0.0
-        start = time.perf_counter(), time.process_time()
-        align(source, d, d, n_clusters=16, refine=refine, n_threads=options.threads)
-        wall = time.perf_counter() - start[0] - source.wall
-        cpu = time.process_time() - start[1] - source.cpu
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(
-            f"16 clusters, {n} texels, {'refined' if refine else 'harmonic'}: {wall:.0f} s "
-            f"({cpu:.0f} s of processors) beside making the samples; peak {peak:.2f} GB",
-            flush=True,
+        alignment, cost = spent(
+            lambda how=refine: align(
+                source, d, d, n_clusters=16, refine=how, n_threads=options.threads
+            )
         )
+        for clock, making in (("wall time, s", source.wall), ("CPU time, s", source.cpu)):
+            cost[clock] = round(cost[clock] - making, 3)
+        errors = frame_errors(alignment.local_from_base, source.frames)[0]
         results.add(
             {
                 "materials": f"16, {n} texels, {'refined' if refine else 'harmonic'}",
-                "wall time, s": wall,
-                "CPU time, s": cpu,
-                "peak memory, GB": peak,
+                "labels right, %": 100 * agreement(alignment.cluster, source.label),
+                "normals, mean degrees": errors.mean(),
+                "95 %": np.percentile(errors, 95),
+                **cost,
             }
         )
+        results.say()
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.measuring import Results
+from benchmarks.measuring import Results, spent
 
 from capture_sim.brightness import measured
 from capture_sim.contributions import contributions, some_pairs
@@ -83,11 +83,12 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=24, help="pixels")
     parser.add_argument("--photographs", type=int, default=6, help="of each preset")
     arguments = parser.parse_args()
-    columns, mistakes = {}, []
+    columns, mistakes, rows = {}, [], []
     for name in PRESETS:
         scene = small(load_scene(name), arguments.side, 4)
-        columns[name], wrong = column(scene, arguments.photographs)
+        (columns[name], wrong), cost = spent(lambda s=scene: column(s, arguments.photographs))
         mistakes += [f"{name}: {effect}" for effect in wrong]
+        rows.append({"preset": name, "wrong": ", ".join(wrong) or "none"} | cost)
     print("| effect | " + " | ".join(f"`{name}`" for name in PRESETS) + " |")
     print("|---" * (len(PRESETS) + 1) + "|")
     results = Results("effects", "What each effect changes", ["capture_sim.write"])
@@ -96,6 +97,12 @@ def main() -> None:
         cells = [columns[name].get(effect.NAME, "-") for name in PRESETS]
         results.add({"effect": effect.NAME} | dict(zip(PRESETS, cells, strict=True)))
         print(f"| `{effect.NAME}` | " + " | ".join(cells) + " |")
+    results.table(
+        "Effects that the plan switched wrongly; time and memory of measuring all of them"
+    )
+    for row in rows:
+        results.add(row)
+        results.say()
     print("wrong: " + (", ".join(mistakes) or "none"))
     print(results.write())
     sys.exit(bool(mistakes))

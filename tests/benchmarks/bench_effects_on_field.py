@@ -90,6 +90,10 @@ def measure(scene: Scene, name: str, out: Path, options: rf.PipelineOptions, wor
     result = rf.reconstruct(capture, folder / "run", options=options, resources=resources)
     counts = {key: value for stage in result.stages for key, value in stage.counts.items()}
     scores = {key: counts[key] for key in COLUMNS}
+    scores |= {
+        "CPU time, s": round(sum(stage.cpu_seconds for stage in result.stages), 1),
+        "peak memory, GB": round(max(stage.peak_bytes for stage in result.stages) / 2**30, 2),
+    }
     (folder / "result.json").write_text(json.dumps(scores, indent=1) + "\n")
     for part in ("capture", "run"):
         shutil.rmtree(folder / part)
@@ -116,7 +120,7 @@ def written(scene: str, scores: dict[str, dict]) -> Path:
     )
     results.table(f"Scene {scene}, a coarse field, unseen views and lights")
     for name, score in scores.items():
-        results.add({"effect": name} | {COLUMNS[key]: score[key] for key in COLUMNS})
+        results.add({"effect": name} | {COLUMNS.get(key, key): score[key] for key in score})
     return results.write()
 
 

@@ -19,15 +19,13 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import resource
 import sys
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from benchmarks.measuring import Results
+from benchmarks.measuring import Results, spent
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -84,7 +82,7 @@ def mean_normal_error(truth):
     return np.rad2deg(np.arctan2(np.hypot(mean[0], mean[1]), mean[2]))
 
 
-def report(name, seconds, result, truth, results):
+def report(name, cost, result, truth, results):
     """One stage: errors, and the errors by margin."""
     results.table(f"Frames after the {name} stage, degrees")
     for label, frames in (
@@ -93,12 +91,12 @@ def report(name, seconds, result, truth, results):
     ):
         normal, turn = frame_errors(frames, truth)
         print(
-            f"{name:9s} {seconds:6.1f} s  {label:21s} degrees: normal median "
+            f"{name:9s} {cost['CPU time, s']:6.1f} s  {label:21s} degrees: normal median "
             f"{np.median(normal):.2f} mean {normal.mean():.2f} 95 % "
             f"{np.percentile(normal, 95):.2f}   turn median {np.median(turn):.2f} 95 % "
             f"{np.percentile(turn, 95):.2f}"
         )
-        results.add({"frames": label, "wall time, s": seconds} | columns(normal, turn))
+        results.add({"frames": label} | columns(normal, turn) | cost)
     print(f"          symmetry {result.symmetries[0]}; errors by margin:")
     print("          margin              texels  normal median   95 %   turn median   95 %")
     edges = np.quantile(result.margin, [0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0])
@@ -110,8 +108,9 @@ def report(name, seconds, result, truth, results):
             f" {np.percentile(turn[mine], 95):8.2f}"
         )
         results.add(
-            {"frames": f"margin {low:.5f} to {high:.5f}", "texels": int(mine.sum())}
+            {"frames": f"margin {low:.5f} to {high:.5f}"}
             | columns(normal[mine], turn[mine])
+            | {"texels": int(mine.sum())}
         )
 
 
@@ -152,19 +151,18 @@ def main() -> None:
     samples = np.concatenate([felt.samples(local[rows], local[rows]) for rows in blocks])
     samples += options.noise * samples.std() * rng.standard_normal(samples.shape, np.float32)
     align(samples[:2], directions, directions)  # compile before the clock starts
+    held = {"of which samples": round(samples.nbytes / 2**30, 3)}
     for name, refine in (
         ("harmonic", False),
         ("refined", RefinementOptions(rounds=options.rounds)),
     ):
-        start = time.perf_counter()
-        result = align(
-            samples, directions, directions, refine=refine, n_threads=options.threads
+        result, cost = spent(
+            lambda how=refine: align(
+                samples, directions, directions, refine=how, n_threads=options.threads
+            )
         )
-        report(name, time.perf_counter() - start, result, truth, results)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"peak memory {peak:.2f} GB, of which samples {samples.nbytes / 2**30:.2f} GB")
-    results.table("Memory")
-    results.add({"peak memory, GB": peak, "of which samples": samples.nbytes / 2**30})
+        report(name, cost | held, result, truth, results)
+        print(f"          peak memory {cost['peak memory, GB']:.2f} GB, {held}")
     print(results.write())
 
 

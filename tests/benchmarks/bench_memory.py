@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -37,7 +38,8 @@ SETTINGS = ("texture.largest=64", "hull.resolution=32", "relighting.samples_per_
 
 
 def watched(words):
-    """Status of a command, and the largest resident memory of all its processes."""
+    """Status of a command, the largest resident memory of all its processes, and its times."""
+    before, start = children_seconds(), time.perf_counter()
     process, peak = subprocess.Popen([sys.executable, "-m", "reflfield", *words]), 0
     while process.poll() is None:
         try:
@@ -46,12 +48,31 @@ def watched(words):
         except psutil.NoSuchProcess:
             break
         time.sleep(0.05)
-    return process.wait(), peak
+    status = process.wait()
+    return status, peak, (time.perf_counter() - start, children_seconds() - before)
 
 
-def sizes(peak, ceiling):
-    """Cells of a peak and of what was allowed."""
-    return {"peak, GB": round(peak / 2**30, 3), "allowed, GB": round(ceiling / 2**30, 3)}
+def children_seconds():
+    """CPU seconds of the commands that have ended."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+def images_cell(folder, command):
+    """PSNR of the photographs that a command has compared, or None."""
+    files = {"run": "out/metrics.json", "compare": "compared/metrics.json"}
+    path = folder / files.get(command, "no")
+    return json.loads(path.read_text())["mean"]["psnr_ldr"] if path.is_file() else None
+
+
+def cells(seconds, peak, ceiling):
+    """Cells of wall and CPU time, of a peak and of what was allowed."""
+    return {
+        "wall time, s": round(seconds[0], 2),
+        "CPU time, s": round(seconds[1], 2),
+        "peak, GB": round(peak / 2**30, 3),
+        "allowed, GB": round(ceiling / 2**30, 3),
+    }
 
 
 def commands(folder, ceiling, model):
@@ -84,16 +105,18 @@ def main():
         write_capture(parse_scene(SCENE), folder / "small")
         enlarged_capture(folder / "small", folder / "large", arguments.side)
         for command, words in commands(folder, arguments.max_memory, arguments.model).items():
-            status, peak = watched(words)
+            status, peak, seconds = watched(words)
             failed |= status != 0 or peak > ceiling
             print(f"{command}: status {status}, at most {gigabytes(peak)} of "
                   f"{gigabytes(ceiling)}", flush=True)  # fmt: skip
-            results.row(command=command, stage="", **sizes(peak, ceiling))
+            what = {"command": command, "stage": "", "PSNR, dB": images_cell(folder, command)}
+            results.add(what | cells(seconds, peak, ceiling))
             if command == "run" and status == 0:
                 timings = json.loads((folder / "out" / "timings.json").read_text())
                 for stage in timings["stages"]:
-                    row = sizes(stage["peak_bytes"], ceiling)
-                    results.row(command=command, stage=stage["name"], **row)
+                    seconds = stage["seconds"], stage["cpu_seconds"]
+                    row = cells(seconds, stage["peak_bytes"], ceiling)
+                    results.add({"command": command, "stage": stage["name"]} | row)
                     print(f"  {stage['name']:<22}{stage['peak_bytes'] / 2**30:5.2f} GB")
     print(results.write())
     return int(failed)

@@ -13,7 +13,6 @@ two workers and timed as a whole; ``--off 20`` compares effects that are off wit
 from __future__ import annotations
 
 import argparse
-import resource
 import sys
 import tempfile
 import time
@@ -23,7 +22,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from benchmarks.measuring import Results
+from benchmarks.measuring import Results, peak, reset_peak, spent
 
 from capture_sim.effects.effect_registry import decided
 from capture_sim.files import write_exr
@@ -126,13 +125,15 @@ def measured(scene, n_views, folder):
 
 
 def report(scene, n_views, results):
+    reset_peak()
     with tempfile.TemporaryDirectory() as folder:
         trace, totals, errors, n_points = measured(scene, n_views, Path(folder))
+    memory = peak() / 2**30
     sampling, shading, writing, every_ray, slow = totals
     whole = trace + sampling + shading + writing
     n_photographs = len(scene.cameras) * len(scene.lights)
     print(f"{n_photographs} photographs, {n_points / n_views:.0f} points a view")
-    results.table(f"{n_photographs} photographs, CPU time of one thread")
+    results.table(f"{n_photographs} photographs, CPU time of one thread, memory of all")
     for name, value in (
         ("visibility of the lights, once", trace),
         ("rays of the pixels, once a view", sampling),
@@ -142,7 +143,8 @@ def report(scene, n_views, results):
     ):
         share = f"{100 * value / whole:4.0f} %"
         print(f"  {name:34}{value:8.1f} s {share} {1e3 * value / n_photographs:8.2f} ms each")
-        results.add({"stage": name, "s": value, "ms each": 1e3 * value / n_photographs})
+        each = 1e3 * value / n_photographs
+        results.add({"stage": name, "s": value, "ms each": each, "peak memory, GB": memory})
     print(f"  {'shading, a ray for every pair':34}{every_ray:8.1f} s")
     print(f"  {'shading, plain sums over pairs':34}{slow:8.1f} s, {slow / shading:.1f} times")
     print(
@@ -150,11 +152,14 @@ def report(scene, n_views, results):
         f"lit pixels changed {errors[1]:.1e}"
     )
     print(f"  error against plain sums: relative L2 {errors[2]:.1e}")
-    results.add({"stage": "shading, a ray for every pair", "s": every_ray})
-    results.add({"stage": "shading, plain sums over pairs", "s": slow})
-    results.add({"stage": "relative L2 against a ray for every pair", "error": errors[0]})
-    results.add({"stage": "share of lit pixels changed", "error": errors[1]})
-    results.add({"stage": "relative L2 against plain sums", "error": errors[2]})
+    results.table("Other ways of shading, and by how much ours differs from them")
+    for how, value, error, changed in (
+        ("a ray for every pair", every_ray, errors[0], errors[1]),
+        ("plain sums over pairs", slow, errors[2], None),
+    ):
+        cells = {"shading": how, "s": value, "times as long": value / shading}
+        differs = {"relative L2": error, "share of lit pixels": changed}
+        results.add(cells | differs | {"peak memory, GB": memory})
     assert errors[2] < 1e-5, "the compiled BRDFs have lost digits"
     assert errors[1] < 1e-3, "visibility at nodes is no longer next to exact"
 
@@ -186,18 +191,17 @@ def off_is_free(n_runs, results):
 
 def write_whole(scene, workers, max_memory, results):
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
-        start, spent = time.perf_counter(), time.process_time()
-        write_capture(scene, Path(folder) / "capture", workers=workers, max_memory=max_memory)
-        wall, spent = time.perf_counter() - start, time.process_time() - spent
+        path = Path(folder) / "capture"
+        _, cost = spent(
+            lambda: write_capture(scene, path, workers=workers, max_memory=max_memory)
+        )
         files = [f for f in Path(folder).rglob("*") if f.is_file()]
         size = sum(file.stat().st_size for file in files)
     n = len(scene.cameras) * len(scene.lights)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     results.table(f"The whole capture, {workers} workers")
-    results.row(photographs=n, wall_s=wall, CPU_s=spent, GB=size / 1e9, peak_memory_GB=peak)
-    print(f"whole capture, {workers} workers: {n} photographs in {wall:.0f} s, {spent:.0f} s "
-          f"of CPU time, {size / 1e9:.2f} GB, peak memory {peak:.2f} GB of "
-          f"{max_memory / 2**30:.2f} allowed")  # fmt: skip
+    allowed = {"allowed, GB": max_memory / 2**30}
+    results.add({"photographs": n, "capture, GB": size / 1e9} | cost | allowed)
+    results.say()
 
 
 def main():

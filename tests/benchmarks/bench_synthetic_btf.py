@@ -1,9 +1,10 @@
 """Frames of a synthetic BTF from its reflectance alone: section 5.1 of the paper.
 
-A relief of 124 x 90 texels with cosine-modulated tangents and one anisotropic material is
-seen from 81 directions under 81 lights. Prints times and errors of the harmonic search and of
-the refinement, for clean samples, for noise and for unobserved ones, and how many unaligned
-components equal two aligned ones (the paper: 20). Draws what its figures 4, 5 and 6 show.
+A relief of 124 x 90 texels with cosine-modulated tangents and one anisotropic material is seen
+from 81 directions under 81 lights. Prints times, memory and errors of the harmonic search
+alone and with the refinement, for clean samples, for noise and for unobserved ones, and how
+many unaligned components equal two aligned ones (the paper: 20). Draws what its figures 4, 5
+and 6 show.
 
     python tests/benchmarks/bench_synthetic_btf.py [--size 124 90] [-o synthetic_btf]
 
@@ -15,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import matplotlib
 import numpy as np
-from benchmarks.measuring import Results
+from benchmarks.measuring import Results, spent
 from matplotlib.colors import LogNorm
 
 from reflfield.alignment import align
@@ -50,7 +50,7 @@ class Recovered(NamedTuple):
     """Frames that one stage recovered, and what it took from the samples on."""
 
     local_from_base: np.ndarray
-    seconds: np.ndarray  # wall time, and CPU time of all threads
+    cost: dict  # time of all that it needs, and peak memory
 
 
 def part(stage, texels):
@@ -70,30 +70,27 @@ def degraded(samples, noise, unobserved):
     return out
 
 
-def clocks():
-    """Wall time and CPU time, seconds; a busy machine lengthens the first only."""
-    return np.array([time.perf_counter(), time.process_time()])
-
-
 def recovered(samples, directions, truth, n_threads):
     """Frames after each stage."""
     stages = {}
     for stage, refine in STAGES.items():
-        start = clocks()
-        result = align(samples, directions, directions, refine=refine, n_threads=n_threads)
-        seconds = clocks() - start
+        result, cost = spent(
+            lambda how=refine: align(
+                samples, directions, directions, refine=how, n_threads=n_threads
+            )
+        )
         frames = with_the_truths_tangents(result.local_from_base, truth)
-        stages[stage] = Recovered(frames, seconds)
+        stages[stage] = Recovered(frames, cost)
     return stages
 
 
 def show(condition, stages, truth, results):
     """Rows of the table of times and errors."""
-    for stage, (frames, seconds) in stages.items():
+    for stage, (frames, cost) in stages.items():
         normals, tangents = frame_errors(frames, truth)
-        wall, cpu = seconds - (stages["harmonic"].seconds if stage == "refined" else 0.0)
+        shown = " | ".join(f"{value:.2f}" for value in cost.values())
         print(
-            f"| {condition} | {stage} | {wall:.1f} | {cpu:.1f} | {normals.mean():.3f} | "
+            f"| {condition} | {stage} | {shown} | {normals.mean():.3f} | "
             f"{np.median(normals):.3f} | {np.percentile(normals, 95):.3f} | "
             f"{tangents.mean():.3f} | {np.percentile(tangents, 95):.3f} |",
             flush=True,
@@ -102,12 +99,11 @@ def show(condition, stages, truth, results):
             {
                 "samples": condition,
                 "stage": stage,
-                "wall time, s": wall,
-                "CPU time, s": cpu,
                 "normals, mean": normals.mean(),
                 "normals, 95 %": np.percentile(normals, 95),
                 "tangents, mean": tangents.mean(),
                 "tangents, 95 %": np.percentile(tangents, 95),
+                **cost,
             }
         )
 
@@ -283,8 +279,8 @@ def main() -> None:
     align(samples[:2], directions, directions)
     print(
         f"{len(samples)} texels, errors in degrees\n"
-        "| samples | stage | s | CPU s | normals mean | median | 95 % | tangents | 95 % |\n"
-        "|---|---|---|---|---|---|---|---|---|"
+        "| samples | stage | s | CPU s | GB | normals | median | 95 % | tangents | 95 % |\n"
+        "|---|---|---|---|---|---|---|---|---|---|"
     )
     clean = recovered(samples, directions, truth, options.threads)
     show("clean", clean, truth, results)

@@ -7,18 +7,38 @@ other options (`bench_sweeps.py`). `make_results.py` draws them; nothing is meas
 
 from __future__ import annotations
 
+from benchmarks import panels
+
 from reflfield.report import plots
 
 CPU = "CPU time, s"
+BLUE, ORANGE, GREEN, PURPLE, GREY = plots.SERIES_COLOURS
+# Searches of `bench_accuracy.py` as they are drawn.
+SEARCHES = {
+    "exact": {"color": BLUE, "marker": "o", "ms": 7},
+    "Eq. 11, highest of the grid": {"color": ORANGE, "marker": "s"},
+    "Eq. 11, then Newton steps": {"color": ORANGE, "marker": "D", "mfc": "white"},
+    "brute force, highest of the grid": {"color": GREEN, "marker": "^", "ms": 7},
+    "brute force, then Newton steps": {"color": GREEN, "marker": "v", "mfc": "white"},
+    "all of align, refined": {"color": PURPLE, "marker": "P"},
+}
 # Rows of `bench_methods.py` in the order in which they are joined: each does more.
-FITS = (
-    "paper",
-    "clusters, grid",
-    "clusters, samples",
-    "half vector, samples",
-    "half vector, images",
-    "default",
-)
+FITS = {
+    "paper": {"color": GREY, "marker": "v"},
+    "clusters, grid": {"color": ORANGE, "marker": "s"},
+    "clusters, samples": {"color": ORANGE, "marker": "o"},
+    "half vector, samples": {"color": GREEN, "marker": "o"},
+    "half vector, images": {"color": GREEN, "marker": "D"},
+    "default": {"color": BLUE, "marker": "P"},
+}
+FIT_NAMES = {
+    "paper": "the paper's clusters, fitted to the grid",
+    "clusters, grid": "our clusters, fitted to the grid",
+    "clusters, samples": "our clusters, fitted to samples",
+    "half vector, samples": "half-vector model, fitted to samples",
+    "half vector, images": "half-vector model, fitted in image space",
+    "default": "the same with geometry from its normals (default)",
+}
 COMPLETIONS = "completion, hemispheric"
 
 
@@ -33,19 +53,42 @@ def pictures(results):
         ("sweeps", sweep_picture),
     ):
         if name in by_name and (picture := draw(by_name[name]["tables"])) is not None:
-            drawn[f"{name}.svg"] = picture.data.decode("utf-8")
+            drawn[f"{name}.svg"] = picture.decode("utf-8")
     return drawn
 
 
-def alignment_picture(tables):
-    """Mean error of the normals over the time of one texel: a curve for each kind of search."""
-    series = {}
-    for row in tables[0]["rows"]:
-        kind, _, what = row["method"].partition(": ")
-        if what.startswith("K=") or kind.startswith("brute"):
-            kind = f"{kind}, L = {row['L']}"
-        series.setdefault(kind, []).append((row["ms per ABRDF"], row["normals"]))
-    return error_curves(series, "CPU time of a texel, ms", "error of the normals, degrees")
+def alignment_picture(tables, file_format="svg"):
+    """Errors of frames over the time of one texel, a column of panels for each band limit."""
+    rows = tables[0]["rows"]
+    limits = sorted({row["L"] for row in rows})
+
+    def draw(figure):
+        grid = figure.subplots(2, len(limits), sharex=True, sharey="row", squeeze=False)
+        for axes, error in zip(grid, ("normals", "tangents"), strict=True):
+            for panel, limit in zip(axes, limits, strict=True):
+                draw_searches(panel, [row for row in rows if row["L"] == limit], error)
+            axes[0].set_ylabel(f"mean error of {error}, degrees")
+        for panel, limit in zip(grid[0], limits, strict=True):
+            panel.set_title(f"L = {limit}", fontsize=10)
+        for panel in grid[-1]:
+            panel.set_xlabel("CPU time of a texel, ms")
+        panels.legend(figure, SEARCHES.items(), 3)
+
+    return panels.encoded(draw, (11.0, 7.0), file_format)
+
+
+def draw_searches(axes, rows, error):
+    """One panel: what each search errs, by K or rounds, and whose choice a point is."""
+    panels.logarithmic(axes, "xy")
+    for search, style in SEARCHES.items():
+        some = [row for row in rows if row["search"] == search]
+        x, y = ([row[name] for row in some] for name in ("ms per texel", error))
+        axes.plot(x, y, lw=1, **style)
+        for i, (row, point) in enumerate(zip(some, zip(x, y, strict=True), strict=True)):
+            if row["remark"]:
+                panels.ringed(axes, point)
+            if row["K or rounds"] and (row["remark"] or i in (0, len(some) - 1)):
+                panels.beside(axes, row["K or rounds"], point)
 
 
 def completion_picture(tables):
@@ -62,25 +105,55 @@ def completion_picture(tables):
 def error_curves(series, x_label, y_label):
     """Curves on logarithmic axes, each in the order of time."""
     curves = {name: tuple(zip(*sorted(points), strict=True)) for name, points in series.items()}
-    return plots.lines(curves, x_label, y_label, log_x=True, log_y=True)
+    return plots.lines(curves, x_label, y_label, log_x=True, log_y=True).data
 
 
 def fit_picture(tables):
-    """PSNR of unseen views and lights over time, from the paper's fit to the default."""
-    series = {}
-    for row in tables[0]["rows"]:
-        if row["images"].startswith("unseen") and row["method"] in FITS:
-            mark = plots.Mark(
-                row[CPU],
-                row["PSNR, dB"],
-                row["method"],
-                is_ringed=row["method"] == "default",
-            )
-            series.setdefault(row["capture"], []).append(mark)
-    for marks in series.values():
-        marks.sort(key=lambda mark: FITS.index(mark.label))
-    label = "PSNR of unseen views and lights, dB"
-    return plots.marked_curves(series, CPU, label, joined=tuple(series)) if series else None
+    """PSNR over time, from the paper's fit to the default, a panel for each capture."""
+    curves = fit_curves(tables[0]["rows"])
+    captures = list(dict.fromkeys(capture for capture, _ in curves))
+
+    def draw(figure):
+        axes = figure.subplots(1, len(captures), squeeze=False)[0]
+        for panel, capture in zip(axes, captures, strict=True):
+            panels.logarithmic(panel, "x")
+            panel.set(title=capture, xlabel=CPU, ylabel="PSNR, dB")
+            draw_fits(panel, curves, capture)
+        styles = [(FIT_NAMES[name], style) for name, style in FITS.items()]
+        lines = [(what, {"color": "black", "ls": ls}) for what, ls in LINES.items()]
+        panels.legend(figure, styles + lines, 2)
+
+    return panels.encoded(draw, (9.0, 5.2)) if curves else None
+
+
+# Of images that the row says: held out of the capture, or of views and lights not in it.
+LINES = {"held out": "--", "unseen views and lights": "-"}
+
+
+def fit_curves(rows):
+    """Points (method, CPU seconds, dB) by capture and images, of captures with all fits."""
+    curves = {}
+    for row in rows:
+        if row["method"] in FITS:
+            images = "held out" if row["images"] == "held out" else "unseen views and lights"
+            point = row["method"], row[CPU], row["PSNR, dB"]
+            curves.setdefault((row["capture"], images), []).append(point)
+    order = list(FITS)
+    return {
+        key: sorted(points, key=lambda point: order.index(point[0]))
+        for key, points in curves.items()
+        if any(name.startswith("half vector") for name, *_ in points)
+    }
+
+
+def draw_fits(axes, curves, capture):
+    """One panel."""
+    for images, line in LINES.items():
+        points = curves.get((capture, images), ())
+        axes.plot([x for _, x, _ in points], [y for *_, y in points], line, color=GREY, lw=1)
+        for name, x, y in points:
+            inside = {} if line == "-" else {"mfc": "white"}
+            axes.plot([x], [y], ls="", ms=8, **FITS[name], **inside)
 
 
 def sweep_picture(tables):
@@ -92,4 +165,6 @@ def sweep_picture(tables):
         )
         series.setdefault(row["capture"], []).append(mark)
     x_label, y_label = "CPU time over the default's", "PSNR over the default's, dB"
-    return plots.marked_curves(series, x_label, y_label, log_x=True) if series else None
+    if not series:
+        return None
+    return plots.marked_curves(series, x_label, y_label, log_x=True).data

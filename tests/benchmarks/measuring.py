@@ -96,6 +96,15 @@ def timed(work, count):
     return answer, *((b - a) / count for a, b in zip(start, end, strict=True))
 
 
+def spent(work):
+    """Answer of one run, and cells of its times and of the process's peak memory meanwhile."""
+    reset_peak()
+    answer, seconds, cpu_seconds = timed(work, 1)
+    values = seconds, cpu_seconds, peak() / 2**30
+    names = "wall time, s", "CPU time, s", "peak memory, GB"
+    return answer, dict(zip(names, (round(value, 3) for value in values), strict=True))
+
+
 def on_cores(n_cores, script, *arguments):
     """Lines of JSON that a script prints in a process of its own on so many cores.
 
@@ -165,6 +174,10 @@ class Results:
     def add(self, cells):
         """One row, as a mapping from column to value."""
         self.tables[-1]["rows"].append({name: plain(value) for name, value in cells.items()})
+
+    def say(self):
+        """Print the last row."""
+        print(self.tables[-1]["rows"][-1], flush=True)
 
     def write(self, folder=None, written_by=None):
         """Write NAME.json, and return its path.

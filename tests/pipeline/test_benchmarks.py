@@ -42,7 +42,7 @@ def test_bench_synthetic_btf(subprocess_run, tmp_path):
     )
     assert done.status == 0, done.err
     table = [line.split("|") for line in done.out.splitlines() if line.startswith("| clean")]
-    errors = {row[2].strip(): float(row[5]) for row in table}
+    errors = {row[2].strip(): float(row[6]) for row in table}
     # Few texels on a coarse relief: a tenth of what a constant guess (the base frame) errs.
     assert errors["refined"] < errors["harmonic"] < 3.0
     assert "unaligned ones" in done.out
@@ -58,10 +58,13 @@ def test_bench_accuracy(subprocess_run, tmp_path):
     )
     assert done.status == 0, done.err
     with (tmp_path / "accuracy_against_time.csv").open(newline="") as file:
-        rows = {row["label"]: row for row in csv.DictReader(file)}
+        rows = {(row["search"], row["K or rounds"]): row for row in csv.DictReader(file)}
     # The grid is coarse (22 degrees between neighbours); the peak is not.
-    assert float(rows["exact"]["normals"]) < 0.5 * float(rows["K=4"]["normals"])
-    assert float(rows["exact"]["milliseconds"]) < float(rows["brute force"]["milliseconds"])
+    exact, grid = rows["exact", ""], rows["Eq. 11, highest of the grid", "4"]
+    brute = rows["brute force, highest of the grid", ""]
+    assert float(exact["normals"]) < 0.5 * float(grid["normals"])
+    assert float(exact["ms per texel"]) < float(brute["ms per texel"])
+    assert (exact["texels"], exact["timed"], brute["timed"]) == ("40", "40", "2")
     assert np.asarray(Image.open(tmp_path / "accuracy_against_time.png")).std() > 20
 
 
