@@ -14,7 +14,7 @@ the grid alone. All are compared with the same held-out photographs, and with th
 and lights that are not in the capture where it has some. CPU time and peak memory are those of
 the stages that a field needs.
 
-Writes results/methods.json.
+Writes results/methods.json. Rows that are in DIR already are not measured again.
 """
 
 from __future__ import annotations
@@ -81,40 +81,43 @@ SOLID = ("vase", "mitsuba_spot")
 
 def measure(results, name, folder):
     """Process one capture with all methods in a folder, and add their rows."""
-    benchmark = CAPTURES[name]
-    folder.mkdir(parents=True)
-    out, log = folder / "out", folder / "log.txt"
-    capture = capture_of(benchmark, folder, log)
-    methods = METHODS | (SOLID_METHODS if name in SOLID else OTHER_METHODS)
-    for options, fields in methods.values():
-        ran("reflfield", ("run", capture, "-o", out, *benchmark.words, *options), log)
-        stages = json.loads((out / "timings.json").read_text())["stages"]
-        for field, method in fields.items():
-            add_row(results, name, method, out / "stages", field, stages)
-            if field == "field" and benchmark.frames:
-                add_frames(results, name, method, out, capture, folder, log)
+    folder.mkdir(parents=True, exist_ok=True)
+    for key in METHODS | (SOLID_METHODS if name in SOLID else OTHER_METHODS):
+        rows = folder / f"{key}.json"
+        if not rows.is_file():
+            rows.write_text(json.dumps(list(measured(name, key, folder)), indent=1) + "\n")
+        for row in json.loads(rows.read_text()):
+            results.add(row)
+            results.say()
 
 
-def add_row(results, name, method, stages_folder, field, stages):
-    """Row of the images that the run itself has compared, held out or unseen."""
-    left_out = "compression" if field != "field" else "without_alignment"
-    stage = "without_alignment" if field != "field" else "compression"
-    size = (stages_folder / stage / "field.rfld").stat().st_size
-    for kind, images in (("heldout", "held out"), ("truth", "unseen")):
-        path = stages_folder / "comparison" / field / f"{kind}.json"
-        if path.is_file():
-            mean = json.loads(path.read_text())["mean"]
-            add(results, (name, images, method), mean, size, needed(stages, left_out))
-
-
-def add_frames(results, name, method, out, capture, folder, log):
-    """Row of images that the benchmark names besides: of unseen views and lights."""
-    what, frames = CAPTURES[name].frames[0]
-    compared = compare(out, capture / frames, folder / method, log)
-    size = (out / "field.rfld").stat().st_size
+def measured(name, key, folder):
+    """Yield the rows of one method."""
+    benchmark, out, log = CAPTURES[name], folder / "out", folder / "log.txt"
+    capture = folder / "capture"
+    if not (capture / "capture.json").is_file():
+        capture = capture_of(benchmark, folder, log)
+    options, fields = (METHODS | SOLID_METHODS | OTHER_METHODS)[key]
+    ran("reflfield", ("run", capture, "-o", out, *benchmark.words, *options), log)
     stages = json.loads((out / "timings.json").read_text())["stages"]
-    spent = needed(stages, "without_alignment")
-    add(results, (name, what, method), compared["mean"], size, spent)
+    for field, method in fields.items():
+        for images, mean in means(field, out / "stages" / "comparison").items():
+            yield row((name, images, method), mean, out / "stages", field, stages)
+        if field == "field" and benchmark.frames:
+            # Of unseen views and lights, which the run has not compared.
+            images, frames = benchmark.frames[0]
+            mean = compare(out, capture / frames, folder / method, log)["mean"]
+            yield row((name, images, method), mean, out / "stages", field, stages)
+
+
+def means(field, folder):
+    """Means over the images that the run itself has compared, held out or unseen."""
+    files = {"held out": f"{field}/heldout.json", "unseen": f"{field}/truth.json"}
+    return {
+        images: json.loads((folder / file).read_text())["mean"]
+        for images, file in files.items()
+        if (folder / file).is_file()
+    }
 
 
 def needed(stages, left_out):
@@ -123,27 +126,29 @@ def needed(stages, left_out):
     return [stage for stage in stages if stage["name"] not in others]
 
 
-def add(results, names, mean, size, stages):
+def row(names, mean, stages_folder, field, stages):
     """One row of the table."""
-    results.add(
-        dict(zip(("capture", "images", "method"), names, strict=True))
-        | {
-            "PSNR, dB": round(mean["psnr_ldr"], 2),
-            "SSIM": round(mean["ssim"], 4),
-            "FLIP": round(mean["flip"], 4),
-            "field, kB": round(size / 1000, 1),
-            "CPU time, s": round(sum(stage["cpu_seconds"] for stage in stages), 1),
-            "peak memory, GB": round(max(s["peak_bytes"] for s in stages) / 2**30, 2),
-        }
-    )
-    print(results.tables[-1]["rows"][-1], flush=True)
+    makers = ["compression", "without_alignment"]
+    if field != "field":
+        makers.reverse()
+    made_by, left_out = makers
+    size = (stages_folder / made_by / "field.rfld").stat().st_size
+    spent = needed(stages, left_out)
+    return dict(zip(("capture", "images", "method"), names, strict=True)) | {
+        "PSNR, dB": round(mean["psnr_ldr"], 2),
+        "SSIM": round(mean["ssim"], 4),
+        "FLIP": round(mean["flip"], 4),
+        "field, kB": round(size / 1000, 1),
+        "CPU time, s": round(sum(stage["cpu_seconds"] for stage in spent), 1),
+        "peak memory, GB": round(max(stage["peak_bytes"] for stage in spent) / 2**30, 2),
+    }
 
 
 def main():
     """Measure the captures that are named, or all that are here."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
-    parser.add_argument("--out", type=Path, help="new folder in which the runs stay")
+    parser.add_argument("--out", type=Path, help="folder in which the runs stay")
     options = parser.parse_args()
     if unknown := set(options.names) - set(NAMES):
         parser.error(f"NAME: expected {', '.join(NAMES)}, received {', '.join(unknown)}")
