@@ -222,8 +222,8 @@ def test_check_says_what_is_not_as_made():
 
 def test_pictures_show_error_against_time_for_what_was_measured():
     rows = [
-        {"method": "ours, 2 passes", "error": 0.01, "CPU, s": 2.0},
-        {"method": "ours, 1 pass", "error": 0.1, "CPU, s": 1.0},
+        {"method": "Brand, block 64, 2 passes", "error": 0.01, "CPU, s": 2.0},
+        {"method": "Brand, block 64, 1 pass", "error": 0.1, "CPU, s": 1.0},
         {"method": "(bound: known)", "error": 0.001, "CPU, s": 1.0},
     ]
     tables = [{"title": "completion, hemispheric, 9 x 8", "rows": rows}]

@@ -39,7 +39,23 @@ FIT_NAMES = {
     "half vector, images": "half-vector model, fitted in image space",
     "default": "the same with geometry from its normals (default)",
 }
-COMPLETIONS = "completion, hemispheric"
+# Methods of `bench_factorization.py`, by the begin of their names; numbers are passes.
+COMPLETIONS = {
+    "MAP recursive least squares": {"color": BLUE, "marker": "o"},
+    "Brand": {"color": ORANGE, "marker": "s"},
+    "softImpute-ALS": {"color": GREEN, "marker": "D"},
+    "IncrementalPCA": {"color": PURPLE, "marker": "^"},
+    "randomized_svd": {"color": GREY, "marker": "v"},
+    "(bound": {"color": "black", "marker": "*", "ms": 9},
+}
+COMPLETION_NAMES = {
+    "MAP recursive least squares": "ours: MAP recursive least squares, by passes",
+    "Brand": "Brand's online SVD, by passes",
+    "softImpute-ALS": "softImpute-ALS, by iterations",
+    "IncrementalPCA": "IncrementalPCA, row means filled in",
+    "randomized_svd": "randomized SVD, row means filled in",
+    "(bound": "bound: the true subspace is known",
+}
 
 
 def pictures(results):
@@ -92,20 +108,37 @@ def draw_searches(axes, rows, error):
 
 
 def completion_picture(tables):
-    """Error of the missing values over time: a curve for each method, by its passes."""
-    rows = next((t["rows"] for t in tables if t["title"].startswith(COMPLETIONS)), ())
-    series = {}
-    for row in rows:
-        if not row["method"].startswith("("):  # a bound, not a method
-            name = row["method"].partition(",")[0]
-            series.setdefault(name, []).append((row["CPU, s"], row["error"]))
-    return error_curves(series, CPU, "relative error of missing values") if series else None
+    """Error of the missing values over time, a panel for each pattern; curves by passes."""
+    patterns = {
+        table["title"].split(",")[1].strip(): table["rows"]
+        for table in tables
+        if table["title"].startswith("completion,")
+    }
+
+    def draw(figure):
+        axes = figure.subplots(1, len(patterns), sharey=True, squeeze=False)[0]
+        for panel, (pattern, rows) in zip(axes, patterns.items(), strict=True):
+            panels.logarithmic(panel, "xy")
+            panel.set(title=f"missing: {pattern}", xlabel=CPU)
+            draw_completions(panel, rows)
+        axes[0].set_ylabel("relative error of missing values")
+        panels.legend(figure, [(COMPLETION_NAMES[n], s) for n, s in COMPLETIONS.items()], 3)
+
+    return panels.encoded(draw, (10.0, 4.6)) if patterns else None
 
 
-def error_curves(series, x_label, y_label):
-    """Curves on logarithmic axes, each in the order of time."""
-    curves = {name: tuple(zip(*sorted(points), strict=True)) for name, points in series.items()}
-    return plots.lines(curves, x_label, y_label, log_x=True, log_y=True).data
+def draw_completions(axes, rows):
+    """One panel."""
+    for name, style in COMPLETIONS.items():
+        some = sorted(
+            (row["CPU, s"], row["error"], row["method"])
+            for row in rows
+            if row["method"].startswith(name)
+        )
+        axes.plot([x for x, *_ in some], [y for _, y, _ in some], lw=1, **style)
+        for x, y, method in some:
+            counts = [word for word in method.split(", ")[-1].split() if word.isdigit()]
+            panels.beside(axes, "".join(counts), (x, y))
 
 
 def fit_picture(tables):

@@ -30,6 +30,7 @@ def logarithmic(axes, directions):
         ticks = axes.xaxis if direction == "x" else axes.yaxis
         ticks.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         ticks.set_minor_formatter(NullFormatter())
+    axes.margins(0.1)
     axes.grid(visible=True, which="both", alpha=0.25)
 
 
