@@ -259,7 +259,7 @@ def cells(one):
 def written(points, folder):
     """Write the results, said as they come, their table as CSV and their picture; the paths."""
     results = Results("accuracy", "What accuracy of the frames costs", MEASURED)
-    results.table("CPU time of one core; mean errors in degrees; memory beyond the samples")
+    results.table("CPU time of one core, mean errors in degrees; memory beyond what was held")
     for one in points:
         results.add(cells(one))
         results.say()

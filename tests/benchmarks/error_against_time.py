@@ -15,13 +15,14 @@ CPU = "CPU time, s"
 BLUE, ORANGE, GREEN, PURPLE, GREY = plots.SERIES_COLOURS
 # Searches of `bench_accuracy.py` as they are drawn.
 SEARCHES = {
-    "exact": {"color": BLUE, "marker": "o", "ms": 7},
+    "exact": {"color": BLUE, "marker": "o", "ms": 7, "zorder": 4},
     "Eq. 11, highest of the grid": {"color": ORANGE, "marker": "s"},
     "Eq. 11, then Newton steps": {"color": ORANGE, "marker": "D", "mfc": "white"},
     "brute force, highest of the grid": {"color": GREEN, "marker": "^", "ms": 7},
     "brute force, then Newton steps": {"color": GREEN, "marker": "v", "mfc": "white"},
     "all of align, refined": {"color": PURPLE, "marker": "P"},
 }
+RINGED = "the paper's K and L; the default of align"
 # Rows of `bench_methods.py` in the order in which they are joined: each does more.
 FITS = {
     "paper": {"color": GREY, "marker": "v"},
@@ -88,14 +89,13 @@ def alignment_picture(tables, file_format="svg"):
             panel.set_title(f"L = {limit}", fontsize=10)
         for panel in grid[-1]:
             panel.set_xlabel("CPU time of a texel, ms")
-        panels.legend(figure, SEARCHES.items(), 3)
+        panels.legend(figure, [*SEARCHES.items(), (RINGED, panels.RING)], 4)
 
     return panels.encoded(draw, (11.0, 7.0), file_format)
 
 
 def draw_searches(axes, rows, error):
     """One panel: what each search errs, by K or rounds, and whose choice a point is."""
-    panels.logarithmic(axes, "xy")
     for search, style in SEARCHES.items():
         some = [row for row in rows if row["search"] == search]
         x, y = ([row[name] for row in some] for name in ("ms per texel", error))
@@ -105,6 +105,7 @@ def draw_searches(axes, rows, error):
                 panels.ringed(axes, point)
             if row["K or rounds"] and (row["remark"] or i in (0, len(some) - 1)):
                 panels.beside(axes, row["K or rounds"], point)
+    panels.logarithmic(axes, "xy")
 
 
 def completion_picture(tables):
@@ -118,7 +119,6 @@ def completion_picture(tables):
     def draw(figure):
         axes = figure.subplots(1, len(patterns), sharey=True, squeeze=False)[0]
         for panel, (pattern, rows) in zip(axes, patterns.items(), strict=True):
-            panels.logarithmic(panel, "xy")
             panel.set(title=f"missing: {pattern}", xlabel=CPU)
             draw_completions(panel, rows)
         axes[0].set_ylabel("relative error of missing values")
@@ -139,6 +139,7 @@ def draw_completions(axes, rows):
         for x, y, method in some:
             counts = [word for word in method.split(", ")[-1].split() if word.isdigit()]
             panels.beside(axes, "".join(counts), (x, y))
+    panels.logarithmic(axes, "xy")
 
 
 def fit_picture(tables):
@@ -149,7 +150,6 @@ def fit_picture(tables):
     def draw(figure):
         axes = figure.subplots(1, len(captures), squeeze=False)[0]
         for panel, capture in zip(axes, captures, strict=True):
-            panels.logarithmic(panel, "x")
             panel.set(title=capture, xlabel=CPU, ylabel="PSNR, dB")
             draw_fits(panel, curves, capture)
         styles = [(FIT_NAMES[name], style) for name, style in FITS.items()]
@@ -187,6 +187,7 @@ def draw_fits(axes, curves, capture):
         for name, x, y in points:
             inside = {} if line == "-" else {"mfc": "white"}
             axes.plot([x], [y], ls="", ms=8, **FITS[name], **inside)
+    panels.logarithmic(axes, "x")
 
 
 def sweep_picture(tables):

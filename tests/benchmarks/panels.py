@@ -7,10 +7,12 @@ import io
 import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 # The same bytes each time, text as outlines. The ground is white, as points are filled with it.
 STYLE = {"svg.hashsalt": "reflfield", "svg.fonttype": "path", "font.size": 9.0}
+
+RING = {"marker": "o", "ms": 13, "mfc": "none", "mec": "black", "mew": 0.9, "ls": ""}
 
 
 def encoded(draw, size, file_format="svg"):
@@ -24,14 +26,17 @@ def encoded(draw, size, file_format="svg"):
 
 
 def logarithmic(axes, directions):
-    """Make axes logarithmic, with ticks in plain numbers."""
+    """Make axes logarithmic, with ticks in plain numbers, after all is drawn."""
+    axes.margins(0.1)
     for direction in directions:
         axes.set(**{f"{direction}scale": "log"})
         ticks = axes.xaxis if direction == "x" else axes.yaxis
+        low, high = ticks.get_view_interval()
+        if high < 100 * low:
+            ticks.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         ticks.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         ticks.set_minor_formatter(NullFormatter())
-    axes.margins(0.1)
-    axes.grid(visible=True, which="both", alpha=0.25)
+    axes.grid(visible=True, alpha=0.25)
 
 
 def beside(axes, text, point, offset=(5, 4)):
@@ -41,7 +46,7 @@ def beside(axes, text, point, offset=(5, 4)):
 
 def ringed(axes, point):
     """Draw a ring around a point that a default makes."""
-    axes.plot(*point, "o", ms=14, mfc="none", mec="black", mew=0.9)
+    axes.plot(*point, **RING)
 
 
 def legend(figure, styles, columns):
