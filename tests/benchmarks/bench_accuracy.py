@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
 import os
 import sys
 from pathlib import Path
@@ -106,7 +107,9 @@ class Cost(NamedTuple):
 
 
 def timed(work, n):
-    """Answer for n texels, and what the faster half of a few runs took."""
+    """Answer for n texels, and what a few runs took: their median."""
+    # Memory that earlier searches have left to the allocator would hide that of this one.
+    ctypes.CDLL(None).malloc_trim(0)
     done = measured(lambda: None, lambda _: work(), repeats=3)
     return done.answer, Cost(done.cpu_seconds, done.megabytes, n)
 
