@@ -153,7 +153,7 @@ def main():
     if unknown := set(options.names) - set(NAMES):
         parser.error(f"NAME: expected {', '.join(NAMES)}, received {', '.join(unknown)}")
     names = options.names or NAMES
-    results = Results("methods", f"Methods on {len(names)} captures", MEASURED)
+    results = Results("methods", f"Methods on {', '.join(names)}", MEASURED)
     results.table("Images, size, time and memory")
     with ExitStack() as stack:
         out = options.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
