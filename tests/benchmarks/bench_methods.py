@@ -14,7 +14,7 @@ the grid alone. All are compared with the same held-out photographs, and with th
 and lights that are not in the capture where it has some. CPU time and peak memory are those of
 the stages that a field needs.
 
-Writes results/methods.json. Rows that are in DIR already are not measured again.
+Writes results/methods.json. Rows that the same code has left in DIR are not measured again.
 """
 
 from __future__ import annotations
@@ -83,11 +83,13 @@ def measure(results, name, folder):
     """Process one capture with all methods in a folder, and add their rows."""
     folder.mkdir(parents=True, exist_ok=True)
     for key in METHODS | (SOLID_METHODS if name in SOLID else OTHER_METHODS):
-        rows = folder / f"{key}.json"
-        if not rows.is_file():
-            rows.write_text(json.dumps(list(measured(name, key, folder)), indent=1) + "\n")
-        for row in json.loads(rows.read_text()):
-            results.add(row)
+        path = folder / f"{key}.json"
+        kept = json.loads(path.read_text()) if path.is_file() else {}
+        if kept.get("code") != results.code:
+            kept = {"code": results.code, "rows": list(measured(name, key, folder))}
+            path.write_text(json.dumps(kept, indent=1) + "\n")
+        for cells in kept["rows"]:
+            results.add(cells)
             results.say()
 
 
