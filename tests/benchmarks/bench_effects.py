@@ -83,6 +83,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=24, help="pixels")
     parser.add_argument("--photographs", type=int, default=6, help="of each preset")
     arguments = parser.parse_args()
+    results = Results("effects", "What each effect changes", ["capture_sim.write"])
     columns, mistakes, rows = {}, [], []
     for name in PRESETS:
         scene = small(load_scene(name), arguments.side, 4)
@@ -91,7 +92,6 @@ def main() -> None:
         rows.append({"preset": name, "wrong": ", ".join(wrong) or "none"} | cost)
     print("| effect | " + " | ".join(f"`{name}`" for name in PRESETS) + " |")
     print("|---" * (len(PRESETS) + 1) + "|")
-    results = Results("effects", "What each effect changes", ["capture_sim.write"])
     results.table(f"Percent of the 99th percentile; {arguments.side} pixels; (ms); bold: on")
     for effect in EFFECTS:
         cells = [columns[name].get(effect.NAME, "-") for name in PRESETS]
