@@ -19,6 +19,9 @@ _SLOPE_ALLOWANCE = 1.1
 # Coarsest cells along the longest side. Fewer would only add levels, more cost time.
 _COARSE_CELLS = 12
 
+# Signed distance, voxels, beyond which only the side is known.
+FARTHEST = 2.0
+
 _BLOCK_POINTS = 1 << 16
 # Up to so many views that may undercut a distance the lowest distances are kept sorted; of more
 # views all distances of a block of points are looked through.
@@ -53,7 +56,7 @@ def carve(views: Sequence[View], grid: Grid, tolerance: int) -> tuple[NDArray[np
     Returns
     -------
     volume : (nx + 1, ny + 1, nz + 1) float32
-        In voxels, clipped to [-2, 2]; negative on the border of the grid.
+        In voxels, clipped to `FARTHEST`; negative on the border of the grid.
     n_evaluated : int
     """
     state = np.zeros([n >> grid.n_levels for n in grid.shape], dtype=np.int8)
@@ -85,13 +88,13 @@ def _corner_values(
     views: Sequence[View], grid: Grid, state: NDArray[np.int8], tolerance: int, n_evaluated: int
 ) -> tuple[NDArray[np.float32], int]:
     """Evaluate the corners of undecided voxels; the others only have a sign."""
-    volume = np.where(_at_corners(state > 0), np.float32(2.0), np.float32(-2.0))
+    volume = np.where(_at_corners(state > 0), np.float32(FARTHEST), np.float32(-FARTHEST))
     corners = np.argwhere(_at_corners(state == 0))
     points = grid.origin + corners * grid.spacing
-    values = smallest_distance(views, points, tolerance, 2.0 * grid.spacing)
+    values = smallest_distance(views, points, tolerance, FARTHEST * grid.spacing)
     if not ((values > 0.0).any() or (state > 0).any()):
         refuse_empty(views[first_emptying(views, points, tolerance, 0.0)])
-    in_voxels = np.clip(values / grid.spacing, -2.0, 2.0)
+    in_voxels = np.clip(values / grid.spacing, -FARTHEST, FARTHEST)
     # A value of exactly zero would make triangles without area.
     in_voxels[np.abs(in_voxels) < 1e-3] = 1e-3
     volume[tuple(corners.T)] = in_voxels

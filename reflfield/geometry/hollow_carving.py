@@ -118,7 +118,7 @@ def carved_hollows(
     if not contradict(hull, views, n_threads):
         return None
     on_hull = depths = search_depths(views, RayScene(hull), 1, n_threads)
-    grid = Grid.around(*_box(outlines, options, tolerance), options.resolution)
+    grid = Grid.around(*hull_box(outlines, options, tolerance), options.resolution)
     volume, _ = carve(outlines, grid, tolerance)
     kept = volume
     for again in reversed(range(ROUNDS)):
@@ -137,7 +137,10 @@ def carved_hollows(
     return CarvedHollows(mesh, 1.0 - after / before, names)
 
 
-def _box(outlines: Sequence[View], options: HullOptions, tolerance: int) -> tuple[Array, Array]:
+def hull_box(
+    outlines: Sequence[View], options: HullOptions, tolerance: int
+) -> tuple[Array, Array]:
+    """Lowest and highest corner of the box that the hull was carved in, metres."""
     low, high = np.array(options.bounds or object_bounds(outlines, tolerance), np.float64)
     return low, high
 

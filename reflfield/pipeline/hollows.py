@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.geometry.cones import measured_views
-from reflfield.geometry.depth_search import LEAST_LIGHTS
+from reflfield.geometry.cones import View, measured_views
+from reflfield.geometry.depth_search import AGREEING, LEAST_LIGHTS
 from reflfield.geometry.hollow_carving import CarvedHollows, carved_hollows, contradict
 from reflfield.geometry.light_stack import ReducedView, reduced_view
 from reflfield.geometry.mesh import write_ply
+from reflfield.geometry.patch_stereo import MOST_SURFACES, PatchView, neighbours
 from reflfield.geometry.specks import without_specks
+from reflfield.geometry.stereo_carving import carved_by_stereo
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
 from reflfield.util.progress import track
@@ -25,30 +27,43 @@ from reflfield.util.progress import track
 MOST_LIGHTS, GLANCE_LIGHTS = 32, 12
 # Longest side of the object in a reduced view, pixels: finer ones show a hollow no better.
 LONGEST_PX = 160
+# The same where patches are compared, and photographs of a view that are taken together.
+STEREO_PX, MOST_PHOTOGRAPHS = 240, 8
 # Share of the memory that the reduced views may take.
 MEMORY_SHARE = 1 / 8
-# Views that must have a photograph under a light for it to count as common to them.
+# Views that must have a photograph under a light for it to count as common to them, or
+# neighbours.
 LEAST_VIEWS = 6
 # Of the hull's volume, and what the stage writes where there is something to carve.
 SHARE, CARVED = "share of the volume carved", "carved.ply"
 
 
-def has_common_lights(context: Context) -> bool:
-    """Whether enough views were photographed under the same lights to compare them."""
+def is_searched(context: Context) -> bool:
+    """Whether hollows are looked for: with common lights, or with views that are neighbours."""
     if context.is_plane or not context.options.hull.hollows:
         return False
+    return has_common_lights(context) or has_neighbours(context)
+
+
+def has_common_lights(context: Context) -> bool:
+    """Whether enough views were photographed under the same lights to compare these."""
     pairs = context.training.photograph_index >= 0
     lights = np.count_nonzero(pairs.sum(axis=0) >= LEAST_VIEWS)
     return bool(lights >= LEAST_LIGHTS)
 
 
+def has_neighbours(context: Context) -> bool:
+    """Whether enough views have two others near enough to compare patches with."""
+    # The object is not known yet; cameras look at it.
+    axes = np.array([camera.forward for camera in context.training.cameras])
+    counts = [len(neighbours(axes, i)) for i in range(len(axes))]
+    return bool(np.count_nonzero(np.array(counts) >= AGREEING) >= LEAST_VIEWS)
+
+
 def write_hollows(context: Context, folder: Path) -> dict[str, Any]:
     """Carve hollows out of the hull; its file is only there where there are some."""
-    hull = results.hull_mesh(context)
-    views = _views_of_hull(context)
-    some = _stacked(context, views, GLANCE_LIGHTS)
-    contradicted = contradict(hull, some, context.resources.workers)
-    carved = _carved(context, views) if contradicted else None
+    carve = _carved_by_lights if has_common_lights(context) else _carved_by_stereo
+    carved = carve(context, _hull_views(context))
     if carved is None:
         return {SHARE: 0.0}
     write_ply(folder / CARVED, carved.mesh)
@@ -59,28 +74,79 @@ def write_hollows(context: Context, folder: Path) -> dict[str, Any]:
     }
 
 
-def _views_of_hull(context: Context) -> NDArray[np.intp]:
-    """Views that the hull is made of."""
+@dataclass(frozen=True, eq=False)
+class HullViews:
+    """Views that the hull is made of.
+
+    Parameters
+    ----------
+    numbers : (n,) int
+    tolerance : int
+        Of them that it lets disagree.
+    """
+
+    numbers: NDArray[np.intp]
+    tolerance: int
+
+    def outlines(self, context: Context) -> list[View]:
+        """As the hull was carved by."""
+        silhouettes = results.silhouettes(context)
+        chosen = [silhouettes[i] for i in self.numbers]
+        cameras = [context.training.cameras[i] for i in self.numbers]
+        return list(without_specks(measured_views(cameras, chosen), chosen, None)[0])
+
+
+def _hull_views(context: Context) -> HullViews:
     details = json.loads(results.file(context, "hull", "hull.json").read_text())
     left_out = set(details.get("left_out", ()))
     names = [camera.id for camera in context.training.cameras]
-    return np.flatnonzero([name not in left_out for name in names])
+    numbers = np.flatnonzero([name not in left_out for name in names])
+    return HullViews(numbers, int(details.get("tolerance", 0)))
 
 
-def _carved(context: Context, views: NDArray[np.intp]) -> CarvedHollows | None:
-    details = json.loads(results.file(context, "hull", "hull.json").read_text())
-    silhouettes = results.silhouettes(context)
-    cameras = [context.training.cameras[i] for i in views]
-    outlines = measured_views(cameras, [silhouettes[i] for i in views])
-    outlines, _, _ = without_specks(outlines, [silhouettes[i] for i in views], None)
+def _carved_by_lights(context: Context, views: HullViews) -> CarvedHollows | None:
+    hull, workers = results.hull_mesh(context), context.resources.workers
+    if not contradict(hull, _stacked(context, views.numbers, GLANCE_LIGHTS), workers):
+        return None
     return carved_hollows(
-        results.hull_mesh(context),
-        outlines,
-        _stacked(context, views, MOST_LIGHTS),
+        hull,
+        views.outlines(context),
+        _stacked(context, views.numbers, MOST_LIGHTS),
         context.options.hull,
-        int(details.get("tolerance", 0)),
+        views.tolerance,
+        workers,
+    )
+
+
+def _carved_by_stereo(context: Context, views: HullViews) -> CarvedHollows | None:
+    index = context.training.photograph_index[views.numbers]
+    photographed = HullViews(views.numbers[(index >= 0).any(axis=1)], views.tolerance)
+    if len(photographed.numbers) < LEAST_VIEWS:
+        return None
+    return carved_by_stereo(
+        results.hull_mesh(context),
+        views.outlines(context),
+        _patch_views(context, photographed.numbers),
+        context.options.hull,
+        views.tolerance,
         context.resources.workers,
     )
+
+
+def _patch_views(context: Context, views: NDArray[np.intp]) -> list[PatchView]:
+    """Reduced views, each with some of its photographs together."""
+    # Of each thread: costs, and their sums along paths.
+    n_bytes = 8 * MOST_SURFACES * context.resources.workers
+    factor = _factor(context, views, n_bytes, STEREO_PX)
+
+    def one(view: np.intp) -> PatchView:
+        index = context.training.photograph_index[view]
+        some = np.flatnonzero(index >= 0)
+        some = some[np.unique(np.linspace(0, len(some) - 1, MOST_PHOTOGRAPHS).astype(int))]
+        return PatchView.of(_reduced(context, int(view), index[some], factor))
+
+    with ThreadPoolExecutor(context.resources.workers) as pool:
+        return list(track(pool.map(one, views), len(views), "views reduced"))
 
 
 def _stacked(context: Context, views: NDArray[np.intp], most: int) -> list[ReducedView]:
@@ -88,34 +154,42 @@ def _stacked(context: Context, views: NDArray[np.intp], most: int) -> list[Reduc
     index = context.training.photograph_index[views]
     common = np.flatnonzero((index >= 0).sum(axis=0) >= LEAST_VIEWS)
     lights = common[np.unique(np.linspace(0, len(common) - 1, most).astype(int))]
-    factor = _factor(context, views, len(lights))
-    one = partial(_reduced, context, index[:, lights], views, factor)
+    # Of all views together.
+    factor = _factor(context, views, 12 * len(lights) * len(views), LONGEST_PX)
+
+    def one(number: int) -> ReducedView:
+        return _reduced(context, int(views[number]), index[number, lights], factor)
+
     with ThreadPoolExecutor(context.resources.workers) as pool:
         return list(track(pool.map(one, range(len(views))), len(views), "views reduced"))
 
 
 def _reduced(
-    context: Context,
-    index: NDArray[np.int64],
-    views: NDArray[np.intp],
-    factor: int,
-    number: int,
+    context: Context, view: int, numbers: NDArray[np.int64], factor: int
 ) -> ReducedView:
-    view, training = int(views[number]), context.training
-    photographs = (None if i < 0 else training.read_photograph(i) for i in index[number])
+    training = context.training
+    photographs = (None if i < 0 else training.read_photograph(int(i)) for i in numbers)
     silhouette = results.silhouettes(context)[view]
     return reduced_view(training.cameras[view], silhouette, photographs, factor)
 
 
-def _factor(context: Context, views: NDArray[np.intp], n_lights: int) -> int:
-    """Factor by which photographs are reduced: to the pixels that suffice and find room."""
+def _factor(context: Context, views: NDArray[np.intp], n_bytes: int, longest: int) -> int:
+    """Factor by which photographs are reduced: to the pixels that suffice and find room.
+
+    Parameters
+    ----------
+    n_bytes : int
+        Memory of a pixel.
+    longest : int
+        Side of the object that suffices, pixels.
+    """
     silhouettes = results.silhouettes(context)
     sides = []
     for view in views:
         rows, columns = np.nonzero(silhouettes[view] >= 0.5)
         sides.append((np.ptp(rows) + 5, np.ptp(columns) + 5))
     pixels = np.array(sides, np.float64)
-    fine = np.median(pixels.max(axis=1)) / LONGEST_PX
-    size = 12.0 * n_lights * pixels.prod(axis=1).sum()
+    fine = np.median(pixels.max(axis=1)) / longest
+    size = n_bytes * pixels.prod(axis=1).mean()
     room = np.sqrt(size / (MEMORY_SHARE * context.resources.max_memory))
     return int(max(np.ceil(fine), np.ceil(room), 1))

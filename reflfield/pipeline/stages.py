@@ -96,7 +96,7 @@ HOLLOWS = Stage(
     after=(HULL,),
     options=lambda options: options.hull,
     reads=stage_inputs.photographs_digest,
-    wanted=hollows.has_common_lights,
+    wanted=hollows.is_searched,
 )
 # mesh -> UV charts -> texel table
 ATLAS = Stage(
