@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import Camera
 from reflfield.errors import ShapeError
-from reflfield.geometry.mesh import Mesh
+from reflfield.geometry.mesh import Mesh, unit_or_zero
 from reflfield.geometry.open3d_library import open3d
 from reflfield.options import available_cores
 from reflfield.util.validation import check_shape
@@ -122,15 +122,47 @@ class RayScene:
         Metres along the ray from the camera; for an orthographic camera from a common
         plane before the mesh. inf where the ray misses or the lens has no ray.
         """
-        origins, directions = camera.rays(pixels)
-        if camera.kind == "orthographic":
-            # Parallel rays have no start of their own: begin before the whole mesh.
-            ahead = (self._origin - origins) @ camera.forward
-            origins = origins + np.outer(ahead - self._scale, camera.forward)
+        origins, directions = self._camera_rays(camera, pixels)
         usable = np.isfinite(directions).all(axis=1)
         depth = np.full(len(origins), np.inf)
         depth[usable] = self.first_hit(origins[usable], directions[usable])[0]
         return depth
+
+    def _camera_rays(self, camera: Camera, pixels: ArrayLike) -> tuple[Array, Array]:
+        """Rays of pixels; parallel ones, which have no start, begin before the whole mesh."""
+        origins, directions = camera.rays(pixels)
+        if camera.kind == "orthographic":
+            ahead = (self._origin - origins) @ camera.forward
+            origins = origins + np.outer(ahead - self._scale, camera.forward)
+        return origins, directions
+
+    def facing(self, camera: Camera, step: int = 1) -> Array:
+        """Cosines between rays of every so many pixels and the smooth normals they meet.
+
+        Parameters
+        ----------
+        camera : Camera
+        step : int
+            Of rows and columns, from the first of each.
+
+        Returns
+        -------
+        (ceil(height / step), ceil(width / step)) float64
+            NaN beside the mesh.
+        """
+        column, row = np.meshgrid(
+            np.arange(0, camera.width, step) + 0.5, np.arange(0, camera.height, step) + 0.5
+        )
+        pixels = np.stack([column.ravel(), row.ravel()], axis=1)
+        origins, directions = self._camera_rays(camera, pixels)
+        cosines = np.full(len(pixels), np.nan)
+        usable = np.flatnonzero(np.isfinite(directions).all(axis=1))
+        _, face, weights = self.first_hit(origins[usable], directions[usable])
+        at = usable[face >= 0]
+        corners = self.mesh.vertex_normals[self.mesh.faces[face[face >= 0]]]
+        normals = unit_or_zero((corners * weights[face >= 0][..., None]).sum(axis=1))
+        cosines[at] = np.abs((normals * directions[at]).sum(axis=1))
+        return cosines.reshape(column.shape)
 
     def row_depths(self, camera: Camera, first: int, end: int) -> Array:
         """`pixel_depths` at the centres of all pixels of some rows, (end - first, width)."""

@@ -100,8 +100,8 @@ class HullOptions:
         Lowest and highest corner of a box, metres, to use instead of the one found from
         the silhouettes: needed where the object leaves the frame in too many views.
     hollows : bool
-        Carve what no silhouette shows to be empty but photographs under several lights do; see
-        `geometry.hollow_carving`.
+        Carve what no silhouette shows to be empty but photographs do: under several lights
+        (`geometry.hollow_carving`), or by stereo (`geometry.stereo_carving`).
     """
 
     resolution: int = 192

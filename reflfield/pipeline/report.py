@@ -40,6 +40,8 @@ from reflfield.pipeline.truth_comparison import TruthScores, truth_scores
 from reflfield.report import sections
 from reflfield.report.page import ReportContent, Section, write_report
 
+# Views of hull and surface, and their longest side, pixels.
+SURFACE_VIEWS, SURFACE_PX = 3, 720
 # Sets of photographs that are compared: title and sentence.
 PHOTOGRAPH_TITLES = {
     "heldout": ("Held-out photographs", "Photographs of the capture that were kept apart."),
@@ -160,6 +162,8 @@ def _surface_sections(
         left_out=() if hull is None else hull.counts.get(LEFT_OUT, ()),
         carved=0.0 if hollows is None else float(hollows.counts[SHARE]),
     )
+    if views := list(surface_views(context)):
+        yield sections.surface_section(views)
     yield sections.atlas_section(
         texels.texel_of_pixel,
         texels.chart,
@@ -178,6 +182,28 @@ def _surface_sections(
     yield sections.normals_section(
         texels.texel_of_pixel, field.local_from_world, texels.local_from_world
     )
+
+
+def surface_views(context: Context) -> Iterator[sections.SurfaceView]:
+    """Some views of hull and surface; none where they are the same."""
+    context = context.refined
+    base = context.is_plane or results.base_mesh(context) is results.hull_mesh(context)
+    if base and not context.on_surface:
+        return
+    scenes = [RayScene(results.hull_mesh(context)), RayScene(results.atlas(context).mesh)]
+    index = context.training.photograph_index
+    photographed = np.flatnonzero((index >= 0).any(axis=1))
+    at = np.unique(np.linspace(0, len(photographed) - 1, SURFACE_VIEWS + 1).astype(int)[:-1])
+    for view in photographed[at]:
+        camera = context.training.cameras[view]
+        photograph = context.training.read_photograph(int(index[view][index[view] >= 0][0]))
+        # As many pixels as a page shows.
+        step = -(-max(photograph.shape[:2]) // SURFACE_PX)
+        yield sections.SurfaceView(
+            camera.id,
+            photograph[::step, ::step],
+            *(scene.facing(camera, step) for scene in scenes),
+        )
 
 
 def _silhouette_views(context: Context) -> Iterator[sections.SilhouetteView]:

@@ -50,8 +50,9 @@ BY_A_PROCESS = ("atlas",)
 PARALLEL_SHARE = {
     **dict.fromkeys(("surface", "compression", "completion", "alignment", "resampling"), 0.8),
     **dict.fromkeys(("silhouettes", "held_out_silhouettes", "comparison"), 0.7),
-    **dict.fromkeys(("hull", "observations", "surface_observations", "indirect"), 0.5),
+    **dict.fromkeys(("hull", "hollows", "observations", "indirect"), 0.5),
     **dict.fromkeys(("surface_indirect", "error_analysis", "model_selection"), 0.6),
+    "surface_observations": 0.5,
     "left_out_views": 0.8,
 }
 # Starting the command and importing its libraries, CPU seconds.
@@ -67,9 +68,6 @@ class StageMeasured(NamedTuple):
     cpu: float
     memory: float
     disk: float
-
-
-# --- amounts of work -------------------------------------------------------------------------
 
 
 def lobes_of(options: PipelineOptions) -> int:
@@ -285,7 +283,11 @@ Work = Callable[[WorkCounts, PipelineOptions], dict[str, float]]
 WORK: dict[str, Work] = {
     "silhouettes": _silhouettes,
     "hull": _hull,
-    "hollows": lambda counts, options: {"observations, pixels": counts.glanced_pixels * UNIT},
+    "hollows": lambda counts, options: {
+        "observations, pixels": counts.glanced_pixels * UNIT,
+        "stereo": float(counts.patches),
+        "stereo, pixels": counts.patch_pixels * UNIT,
+    },
     "atlas": _atlas,
     "visibility": _visibility,
     "observations": _observations,
@@ -339,9 +341,6 @@ def disk_of(stage: str, counts: WorkCounts, options: PipelineOptions) -> dict[st
     }.get(stage, counts.n_texels)
     kind = stage.removeprefix("surface_")
     return {f"{kind}": 1.0, f"{kind}, amount": amount * UNIT}
-
-
-# --- unit costs ------------------------------------------------------------------------------
 
 
 def work_of(stage: str, counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:

@@ -10,12 +10,18 @@ import numpy as np
 
 from reflfield.capture.capture import Capture
 from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR, MOST_SAMPLES
+from reflfield.geometry.stereo_carving import MOST_VIEWS
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline.atlas import TYPICAL_USE
 from reflfield.pipeline.cache import StageFolder
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.context import AUTO, Context
-from reflfield.pipeline.hollows import GLANCE_LIGHTS
+from reflfield.pipeline.hollows import (
+    GLANCE_LIGHTS,
+    STEREO_PX,
+    has_common_lights,
+    is_searched,
+)
 from reflfield.pipeline.model_selection import can_fit_samples, least_samples
 from reflfield.pipeline.pipeline_options import SMALLEST_TEXTURE, PipelineOptions
 
@@ -28,6 +34,8 @@ LARGEST_USE, PADDING_SIDE, LEAST_USE = 0.62, 40.0, 0.2
 # Of the pairs of views and lights, which a texel of a solid object sees: half a sphere each,
 # less what is too grazing or in shadow.
 SEEN_VIEWS, SEEN_LIGHTS = 0.42, 0.42
+# Share of a square around its outline that an object covers.
+STEREO_SHARE = 0.45
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,8 @@ class WorkCounts:
         Whether light in shadows is fitted.
     one_view : bool
         Whether the frames are those of photometric stereo, of one view under known lights.
+    patches : bool
+        Whether patches of neighbouring views are compared, under too few lights.
     """
 
     n_views: int
@@ -89,12 +99,23 @@ class WorkCounts:
     is_plane: bool
     shades: bool
     one_view: bool
+    patches: bool
+
+    @property
+    def patch_pixels(self) -> float:
+        """Pixels whose patches are compared with other views."""
+        if not self.patches:
+            return 0.0
+        of_view = min(self.covered_pixels / self.n_views, STEREO_SHARE * STEREO_PX**2)
+        return min(self.n_views, MOST_VIEWS) * of_view
 
     @property
     def glanced_pixels(self) -> float:
         """Pixels of the photographs that are searched for hollows; most objects have none."""
         if self.is_plane or self.n_views == 1:
             return 0.0
+        if self.patches:
+            return self.photograph_pixels
         return min(GLANCE_LIGHTS / max(self.n_lights, 1), 1.0) * self.photograph_pixels
 
 
@@ -175,6 +196,7 @@ def counts_of(context: Context, share: float | None = None) -> WorkCounts:
         is_plane=context.is_plane,
         shades=context.options.indirect.enabled and _factors_shadows(context),
         one_view=context.photometric,
+        patches=is_searched(context) and not has_common_lights(context),
     )
 
 

@@ -364,9 +364,10 @@ def test_one_wrong_view_does_not_eat_a_surface_away():
     """A mean over all would move it by a third of the band."""
     right = seen_planes([0.1, 0.1, 0.1])
     wrong = seen_planes([-0.3])
+    # As above; and the blur of a voxel of .02.
     assert level(carved_by_depths(FULL, GRID, right + wrong)) == pytest.approx(0.1, abs=2e-4)
     most = carved_by_depths(FULL, GRID, right[:1] + wrong * 2)
-    assert level(most) == pytest.approx(-0.3, abs=0.01)
+    assert level(most) == pytest.approx(-0.3, abs=0.01)  # the blur, again
 
 
 def test_what_no_view_sees_stays_and_nothing_grows():
@@ -421,3 +422,26 @@ class TestHardCases:
 
     def test_not_seen_is_no_brightness(self):
         assert NOT_SEEN < -1e6
+
+
+def test_facing_is_the_cosine_of_rays_and_normals():
+    made = trimesh.creation.icosphere(5)
+    scene = RayScene(Mesh(np.asarray(made.vertices), np.asarray(made.faces)))
+    camera = Camera.look_at(
+        [0.0, -4.0, 0.0], [0, 0, 0], [0, 0, 1], width=41, height=31, fov_deg=40
+    )
+    cosines = scene.facing(camera, 2)
+    assert cosines.shape == (16, 21)
+    rows, columns = np.mgrid[0:31:2, 0:41:2]
+    origins, rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5)
+    # Distance of each ray from the middle of the unit sphere, and the sine that it is.
+    along = -(origins * rays).sum(axis=1)
+    sine = np.linalg.norm(origins + along[:, None] * rays, axis=1)
+    expected = np.sqrt(np.maximum(1 - sine**2, 0)).reshape(cosines.shape)
+    inside = (sine < 0.97).reshape(cosines.shape)
+    # Triangles of .02 radians: a third of that, where the ray is steep.
+    np.testing.assert_allclose(cosines[inside], expected[inside], atol=0.006)
+    assert np.isnan(cosines[(sine > 1.01).reshape(cosines.shape)]).all()
+    parallel = replace(camera, kind="orthographic", fl_x=20.0, fl_y=20.0)
+    # A ray beside the middle by half a pixel of 1/20.
+    assert scene.facing(parallel)[15, 20] == pytest.approx(1.0, abs=0.005)

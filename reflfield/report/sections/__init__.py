@@ -42,6 +42,7 @@ from reflfield.report.sections.size_and_quality import (
     RatePoint,
     rate_distortion_section,
 )
+from reflfield.report.sections.surface_views import SurfaceView, surface_section
 from reflfield.report.sections.truth_scores import truth_section
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "RatePoint",
     "SilhouetteView",
     "StageSummary",
+    "SurfaceView",
     "ablation_section",
     "alignment_section",
     "analysis_lines",
@@ -73,5 +75,6 @@ __all__ = [
     "run_section",
     "silhouettes_section",
     "stages_section",
+    "surface_section",
     "truth_section",
 ]
