@@ -26,6 +26,7 @@ from scipy.ndimage import generic_filter, median_filter
 from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.geometry.light_stack import ReducedView, pixel_centres, projection_matrix
 from reflfield.geometry.ray_scene import RayScene
+from reflfield.util.progress import track
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -132,10 +133,8 @@ def search_depths(
     def one(index: int) -> ViewDepths:
         return _depths_of(views[index], packed, scene, _others(towards, index), every)
 
-    if n_threads == 1:
-        return [one(i) for i in range(len(views))]
     with ThreadPoolExecutor(n_threads) as pool:
-        return list(pool.map(one, range(len(views))))
+        return list(track(pool.map(one, range(len(views))), len(views), "depths by light"))
 
 
 def _packed(views: Sequence[ReducedView]) -> _Views:

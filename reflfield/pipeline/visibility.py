@@ -18,6 +18,7 @@ from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import TexelTable
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
+from reflfield.pipeline.memory import readers_at_once
 from reflfield.util.dask_cluster import threads_here
 
 # Views, or lights, of one block.
@@ -27,18 +28,21 @@ DIRECTIONS_AT_ONCE = 8
 def write_visibility(context: Context, folder: Path) -> dict[str, Any]:
     """Which camera and which light each texel sees."""
     capture, texels = context.training, results.texels(context)
+    # Depths of an image take what reading a photograph does.
+    at_once = readers_at_once(context)
     shared = VisibilityRays(
         capture,
         texels,
         results.atlas(context).mesh,
         context.options.visibility,
         [None] * capture.n_views if context.is_plane else covered_pixels(context),
-        context.resources.workers,
+        context.resources.workers if at_once == 1 else 1,
     )
     view_runs, light_runs = runs(capture.n_views), runs(capture.n_lights)
     named = [("views", run) for run in view_runs] + [("lights", run) for run in light_runs]
-    # The rays have threads of their own.
-    parts = context.blocks(folder).map("visibility", visibility_block, shared, named, at_once=1)
+    parts = context.blocks(folder).map(
+        "visibility", visibility_block, shared, named, at_once=at_once
+    )
     columns = [arrays["seen"] for arrays in parts]
     views = np.concatenate(columns[: len(view_runs)], axis=1)
     lights = np.concatenate(columns[len(view_runs) :], axis=1)
@@ -69,7 +73,7 @@ class VisibilityRays:
     covered : sequence of (n,) uint8 or None
         Pixels of the views that the object covers, row by row, eight in a byte.
     threads : int
-        For rays; a cluster's worker uses its own number.
+        For the rays of a block; a cluster's worker uses its own number.
     """
 
     capture: Capture
