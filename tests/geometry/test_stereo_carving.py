@@ -215,6 +215,22 @@ def test_depths_around_the_true_surface_lean_to_neither_side(textured, hull):
     assert np.median(np.abs(off)) < 0.01
 
 
+def test_noise_goes_both_ways_where_the_hull_is_the_surface():
+    """Planes behind the hull alone would let depths err inwards only."""
+    views, coverages, photographs = photographed(ball())
+    mesh = visual_hull(views, coverages, OPTIONS)[0]
+    seen_views = patch_views(views, coverages, photographs)
+    (seen,) = PatchStereo(seen_views, RayScene(mesh), [14]).depths(None, "test")
+    x = round(views[14].cx - seen.camera.cx)
+    y = round(views[14].cy - seen.camera.cy)
+    height, width = seen.depth.shape
+    off = seen.depth - true_depth(mesh, views[14])[y : y + height, x : x + width]
+    off = off[np.isfinite(off)] / seen.spacing
+    assert np.mean(off < -0.2) > 0.1
+    # Planes that curve away from the ball: half of their spacing, not more.
+    assert abs(np.median(off)) < 0.6
+
+
 def brute_force_cost(own, covered, other, at, places):
     """Cost of one patch against one view, from its definition, by SciPy's interpolation."""
     y, x = at
