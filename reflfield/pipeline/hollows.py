@@ -16,9 +16,14 @@ from reflfield.geometry.depth_search import AGREEING, LEAST_LIGHTS
 from reflfield.geometry.hollow_carving import CarvedHollows, carved_hollows, contradict
 from reflfield.geometry.light_stack import ReducedView, reduced_view
 from reflfield.geometry.mesh import write_ply
-from reflfield.geometry.patch_stereo import MOST_SURFACES, PatchView, neighbours
+from reflfield.geometry.patch_stereo import (
+    MOST_SURFACES,
+    PatchView,
+    neighbours,
+    spread_views,
+)
 from reflfield.geometry.specks import without_specks
-from reflfield.geometry.stereo_carving import carved_by_stereo
+from reflfield.geometry.stereo_carving import MOST_VIEWS, carved_by_stereo
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
 from reflfield.util.progress import track
@@ -106,12 +111,14 @@ def _hull_views(context: Context) -> HullViews:
 
 def _carved_by_lights(context: Context, views: HullViews) -> CarvedHollows | None:
     hull, workers = results.hull_mesh(context), context.resources.workers
-    if not contradict(hull, _stacked(context, views.numbers, GLANCE_LIGHTS), workers):
+    axes = np.array([context.training.cameras[i].forward for i in views.numbers])
+    some = views.numbers[spread_views(axes, MOST_VIEWS)]
+    if not contradict(hull, _stacked(context, some, GLANCE_LIGHTS), workers):
         return None
     return carved_hollows(
         hull,
         views.outlines(context),
-        _stacked(context, views.numbers, MOST_LIGHTS),
+        _stacked(context, some, MOST_LIGHTS),
         context.options.hull,
         views.tolerance,
         workers,

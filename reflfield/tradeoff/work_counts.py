@@ -116,7 +116,9 @@ class WorkCounts:
             return 0.0
         if self.patches:
             return self.photograph_pixels
-        return min(GLANCE_LIGHTS / max(self.n_lights, 1), 1.0) * self.photograph_pixels
+        of_views = min(MOST_VIEWS / self.n_views, 1.0)
+        of_lights = min(GLANCE_LIGHTS / max(self.n_lights, 1), 1.0)
+        return of_views * of_lights * self.photograph_pixels
 
 
 def planned_context(
