@@ -40,6 +40,10 @@ START_QUANTILE, LEAST_START_COSINE = 0.3, 0.2
 TIE = 1e-3
 # Rows that tables are fitted to.
 TABLE_ROWS = 300_000
+# Samples of a texel that are fitted to; of more the others hardly change its few coefficients.
+MOST_SAMPLES = 1024
+# Odd numbers that scatter those of texels and photographs over 64 bits (splitmix64).
+_MIXERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,7 @@ class SampleBlock:
 def sample_block(
     texels: Indices, samples: TexelSamples, reliable: NDArray[np.bool_], white: float
 ) -> SampleBlock:
-    """Samples that count of some texels.
+    """Samples that count of some texels, of each `MOST_SAMPLES` or little more at most.
 
     Parameters
     ----------
@@ -99,7 +103,7 @@ def sample_block(
         What 1 stands for, 1/sr.
     """
     pairs, lit = samples.pairs, samples.light_seen & reliable
-    t, photograph = np.nonzero(pairs.both(samples.view_seen, lit))
+    t, photograph = np.nonzero(_some(pairs.both(samples.view_seen, lit), texels))
     factor = np.float32(samples.unit / white)
     first = np.searchsorted(t, np.arange(len(texels) + 1)).astype(np.int64)
     view, light = pairs.view[photograph], pairs.light[photograph]
@@ -124,6 +128,20 @@ def sample_block(
         lights=lights,
         camera=view.astype(np.int16),
     )
+
+
+def _some(counted: NDArray[np.bool_], texels: Indices) -> NDArray[np.bool_]:
+    """Photographs (n, n_photographs) that count, thinned out evenly where they are many.
+
+    Which ones depends on the numbers of texel and photograph alone.
+    """
+    share = MOST_SAMPLES / np.maximum(counted.sum(axis=1), 1)
+    if (share >= 1).all():
+        return counted
+    of_photograph = np.arange(counted.shape[1], dtype=np.uint64) * np.uint64(_MIXERS[0])
+    mixed = (texels.astype(np.uint64) * np.uint64(_MIXERS[1]))[:, None] ^ of_photograph
+    mixed = (mixed ^ (mixed >> np.uint64(31))) * np.uint64(_MIXERS[2])
+    return counted & ((mixed >> np.uint64(32)) < (share * 2.0**32)[:, None])
 
 
 @dataclass(frozen=True, eq=False)

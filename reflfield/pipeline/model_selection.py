@@ -132,7 +132,7 @@ def _supports_half_vector(context: Context, visibility: str) -> bool:
     if visibility == "kept" or not context.casts_shadows or wants_clusters:
         return False
     n = _samples_with(context, visibility)
-    return least_samples(context) <= n <= MOST_SAMPLES
+    return n >= least_samples(context)
 
 
 def nearest_samples_do(context: Context) -> bool:
@@ -388,7 +388,7 @@ def sentences(context: Context) -> Iterator[str]:
         yield (
             f'{MODEL} = "auto" selected "{options.compression.model}": '
             f"{n:.0f} samples per texel, the half-vector model takes {least_samples(context)} "
-            f"to {MOST_SAMPLES} of a solid object under known lights."
+            "or more of a solid object under known lights."
         )
     yield from _left_out_sentences(context)
     if asked.compression.fit == AUTO and options.compression.fit != AUTO:

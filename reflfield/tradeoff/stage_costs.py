@@ -79,18 +79,18 @@ def lobes_of(options: PipelineOptions) -> int:
 def _left_out_views(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     """Fits of the half-vector model to a few texels with one lobe, two, and so on."""
     rounds = sum(k * rounds_of(k) for k in range(1, MOST_LOBES + 1))
-    samples = min(counts.n_texels, LOBE_TEXELS) * counts.n_photographs
+    samples = min(counts.n_texels, LOBE_TEXELS) * counts.fitted_photographs
     return {"search of lobes": 1.0, "search of lobes, samples": rounds * samples * UNIT}
 
 
 def _hull_fit(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]:
     """Fit of the half-vector model to samples, and to photographs, on the hull."""
-    n_photographs, lobes = counts.n_photographs, lobes_of(options)
+    n_photographs, lobes = counts.fitted_photographs, lobes_of(options)
     some = min(counts.n_texels, TRAINING_TEXELS)
     return {
         "tables, rounds": float(lobes * rounds_of(lobes)),
         "tables, samples": lobes * rounds_of(lobes) * some * n_photographs * UNIT,
-        "coefficients, samples": lobes * counts.n_samples * UNIT,
+        "coefficients, samples": lobes * counts.n_texels * n_photographs * UNIT,
         **_image_fit(counts, options),
     }
 
@@ -101,7 +101,7 @@ def _image_fit(counts: WorkCounts, options: PipelineOptions) -> dict[str, float]
     return {
         "image steps": float(steps > 0),
         "image steps, tables": float(steps * lobes),
-        "image steps, pixels": steps * (1 + lobes) * counts.covered_values * UNIT,
+        "image steps, pixels": steps * (1 + lobes) * counts.fitted_values * UNIT,
         "image steps, texels": steps * counts.n_texels * UNIT,
     }
 
@@ -321,7 +321,7 @@ def memory_of(stage: str, counts: WorkCounts, options: PipelineOptions) -> dict[
     if not fits:
         return held | {"held, pixels": counts.largest_pixels * UNIT}
     kind = "fit" if counts.model == HALF_VECTOR else "clusters"
-    pixels = counts.covered_values if kind == "fit" else 0.0
+    pixels = counts.fitted_values if kind == "fit" else 0.0
     return held | {
         f"{kind}, memory": 1.0,
         f"{kind}, held samples": counts.n_samples * UNIT,

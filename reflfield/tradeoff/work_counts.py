@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from reflfield.capture.capture import Capture
-from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR, MOST_SAMPLES
+from reflfield.field.clustered_pca import CLUSTERED, HALF_VECTOR
+from reflfield.fitting.texel_sample_fit import MOST_SAMPLES as MOST_FITTED
 from reflfield.geometry.stereo_carving import MOST_VIEWS
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline.atlas import TYPICAL_USE
 from reflfield.pipeline.cache import StageFolder
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.context import AUTO, Context
+from reflfield.pipeline.half_vector_fit import MOST_PIXELS
 from reflfield.pipeline.hollows import (
     GLANCE_LIGHTS,
     STEREO_PX,
@@ -100,6 +102,16 @@ class WorkCounts:
     shades: bool
     one_view: bool
     patches: bool
+
+    @property
+    def fitted_photographs(self) -> float:
+        """Photographs whose samples of a texel are fitted to; of many those of some."""
+        return min(self.n_photographs, MOST_FITTED / (SEEN_VIEWS * SEEN_LIGHTS))
+
+    @property
+    def fitted_values(self) -> float:
+        """Pixels of the object in all photographs that are fitted to."""
+        return min(self.covered_values, MOST_PIXELS)
 
     @property
     def patch_pixels(self) -> float:
@@ -254,7 +266,7 @@ def planned_model(context: Context) -> str:
     if clusters or not _factors_shadows(context):
         return CLUSTERED
     n = samples_of_texel(context)
-    return HALF_VECTOR if least_samples(context) <= n <= MOST_SAMPLES else CLUSTERED
+    return HALF_VECTOR if n >= least_samples(context) else CLUSTERED
 
 
 def _n_fits(context: Context, model: str) -> int:

@@ -10,6 +10,7 @@ from reflfield.field.half_vector import evaluate_half_vector, half_angles
 from reflfield.fitting.tangents import with_tangents_along_highlights
 from reflfield.fitting.texel_graph import TexelGraph, texel_graph
 from reflfield.fitting.texel_sample_fit import (
+    MOST_SAMPLES,
     SampleBlock,
     SampleBlocks,
     fit_to_samples,
@@ -217,3 +218,55 @@ def test_samples_keep_their_directions_however_few_pairs_were_photographed(
     np.testing.assert_array_equal(block.lights[row, block.light], samples.lights[t, light])
     if photographed != "all pairs":
         assert block.views.shape[1] == np.diff(block.first).max() < k
+
+
+def many_samples(rng, n, n_views, n_lights, seen=1.0):
+    """Samples of texels that many photographs show, each with a value of its own."""
+    pairs = PhotographedPairs.product(n_views, n_lights)
+    values = np.arange(n * len(pairs), dtype=np.float32).reshape(n, len(pairs), 1)
+    return TexelSamples(
+        samples=np.repeat(values, 3, axis=2),
+        views=unit(rng, n, n_views),
+        lights=unit(rng, n, n_lights),
+        view_seen=rng.random((n, n_views)) < seen,
+        light_seen=np.ones((n, n_lights), bool),
+        pairs=pairs,
+        unit=1.0,
+    )
+
+
+def test_many_samples_of_a_texel_are_thinned_out_evenly(small_rng):
+    n, side = 12, 70
+    samples = many_samples(small_rng, n, side, side, seen=0.7)
+    reliable = np.ones((n, side), bool)
+    block = sample_block(np.arange(100, 100 + n), samples, reliable, 1.0)
+    counts = np.diff(block.first)
+    # Draws of about 3430 with a probability of .3: four deviations of 27.
+    assert np.abs(counts - MOST_SAMPLES).max() < 110
+    # As many of each view and of each light: of some 12 * 1024 in 70, four deviations of 13.
+    for place, seen in ((block.view, samples.view_seen), (block.light, reliable)):
+        drawn = np.bincount(place, minlength=side) / seen.sum(axis=0)
+        assert drawn.std() < 1.6 * np.sqrt(drawn.mean())
+    # Other ones of each texel: a pair that one has, another has by chance.
+    chosen = np.zeros((n, side * side), bool)
+    row = np.repeat(np.arange(n), counts)
+    chosen[row, block.values[:, 0].astype(np.int64) % (side * side)] = True
+    both = (chosen[0] & chosen[1]).sum() / chosen[0].sum()
+    # .7 seen, .3 drawn: .21, four deviations of .013.
+    assert abs(both - 0.21) < 0.05
+
+
+def test_thinning_depends_on_texel_and_photograph_alone(small_rng):
+    samples = many_samples(small_rng, 4, 60, 60)
+    reliable = np.ones((4, 60), bool)
+    whole = sample_block(np.arange(4), samples, reliable, 1.0)
+    names = ("samples", "views", "lights", "view_seen", "light_seen")
+    part = replace(samples, **{name: getattr(samples, name)[2:] for name in names})
+    alone = sample_block(np.arange(2, 4), part, reliable[2:], 1.0)
+    np.testing.assert_array_equal(whole.values[whole.first[2] :], alone.values)
+
+
+def test_few_samples_are_all_kept(small_rng):
+    samples = many_samples(small_rng, 3, 16, 64)
+    block = sample_block(np.arange(3), samples, np.ones((3, 64), bool), 1.0)
+    assert np.diff(block.first).tolist() == [MOST_SAMPLES] * 3
