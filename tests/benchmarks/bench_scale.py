@@ -1,16 +1,18 @@
 """The paper's job, 151 x 151 photographs and 256 x 256 texels, on this machine.
 
     python tests/benchmarks/bench_scale.py OUT    # simulate, process, compress, compare
+    python tests/benchmarks/bench_scale.py OUT --model auto
     python tests/benchmarks/bench_scale.py OUT --kill 5
     python tests/benchmarks/bench_scale.py OUT --kill-worker nanny
     python tests/benchmarks/bench_scale.py OUT --per-texel 64 128 256
 
 A vase of glaze and paint with brushed bands of gold stands in a dome. The first form prints
-seconds and peak memory of every stage; the second processes once more, kills the process
-(SIGKILL) at random moments, runs it again, and compares; the third processes on a Dask
+seconds and peak memory of every stage with the paper's model, the second with the one that a
+plain run takes, or another; the third processes once more, kills the process
+(SIGKILL) at random moments, runs it again, and compares; the fourth processes on a Dask
 cluster of two worker processes, kills one of them at a random moment of each stage that
 reads or writes the samples, to be started again by its nanny (or, with `alone`, kills one
-for good, and the other does the rest), and compares; the fourth prints what one texel costs
+for good, and the other does the rest), and compares; the fifth prints what one texel costs
 at several sizes of the texture. What is done already is not done again, so the forms
 may follow each other. The bases are shaped by 2048 texels; all are completed and fitted.
 """
@@ -56,6 +58,7 @@ BY_TEXELS = {
 }
 
 MEASURED = ("reflfield.pipeline.stages",)
+CLUSTERED = "clustered"
 # Stages in which a worker is killed: those that read or write the samples by blocks.
 LOSING = ("observations", "completion", "alignment", "resampling", "compression")
 
@@ -91,7 +94,7 @@ def process_words(
     options = {
         "atlas.resolution": texels,
         "completion.training_texels": training,
-        "compression.model": "clustered",
+        "compression.model": arguments.model,
         "compression.training_texels": training,
     }
     settings = [word for item in options.items() for word in ("--set", "{}={}".format(*item))]
@@ -111,10 +114,14 @@ def say(name: str, seconds: float, cpu: float | None, peak: float) -> None:
 
 def processed(arguments: argparse.Namespace, capture: Path) -> None:
     """Process the capture, and print what each stage took."""
-    out = arguments.out / "run"
+    clustered = arguments.model == CLUSTERED
+    out = arguments.out / ("run" if clustered else f"run_{arguments.model}")
     call(*process_words(arguments, capture, out, arguments.texels, 2048))
     timings = json.loads((out / "timings.json").read_text())
-    results = Results("scale", "The paper's job", MEASURED)
+    name, title = ("scale", "The paper's job")
+    if not clustered:
+        name, title = f"scale_{arguments.model}", f"{title}, the model {arguments.model}"
+    results = Results(name, title, MEASURED)
     directions, pixels = arguments.directions, arguments.pixels
     size = f"{pixels} pixels, {arguments.texels} texels a side"
     results.table(f"{directions} x {directions} photographs, {size}")
@@ -391,6 +398,8 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=256, help="side of the photographs")
     parser.add_argument("--texels", type=int, default=256, help="side of the texture")
     parser.add_argument("--points", type=int, default=100, help="true ABRDFs to compare with")
+    models = (CLUSTERED, "half_vector", "auto")
+    parser.add_argument("--model", choices=models, default=CLUSTERED)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--max-memory", default="6GB")
     parser.add_argument("--config", type=Path, help="further options in TOML")
