@@ -7,7 +7,7 @@ Settings are chosen on photographs that make no field, and reported on others; t
 (`reflfield/tradeoff/presets.py`) are chosen from these sweeps. A sweep that is finished in
 SWEEPS, with its budget, is not made again.
 
-Writes results/sweeps.json. The simulated captures are made in SWEEPS; the others are test data,
+Writes results/sweep_NAME.json. The simulated captures are made in SWEEPS; the others are test data,
 looked for in REFLFIELD_DATA, by default ../shared/data, and skipped where absent.
 """
 
@@ -26,6 +26,8 @@ from benchmarks.measuring import Results  # noqa: E402
 
 CAPTURES = ("demo_vase", "mitsuba_spot", "rti_loewenkopf", "dinoSparseRing")
 ALONE, DEFAULT = "alone", "default"
+MEASURED = ("reflfield.cli",)
+TITLES = ("One option at a time", "All views and lights", "Picks of the front")
 
 
 def swept(name, out, budget):
@@ -79,21 +81,20 @@ def main():
     options = parser.parse_args()
     if unknown := set(options.names) - set(CAPTURES):
         parser.error(f"NAME: expected {', '.join(CAPTURES)}, received {', '.join(unknown)}")
-    rows = ([], [], [])
     for name in options.names or CAPTURES:
         if RUNS[name].folder and not (DATA / RUNS[name].folder).is_dir():
             print(f"{name}: skipped: {DATA / RUNS[name].folder} not found: set REFLFIELD_DATA")
             continue
+        results = Results(f"sweep_{name}", f"What options cost and bring: {name}", MEASURED)
         document = swept(name, options.out, options.budget)
         print(f"{name}: {document['photographs']}; not run: {len(document['not run'])}")
+        rows = ([], [], [])
         add_rows(rows, name, document)
-    results = Results("sweeps", "Sweeps: what options cost and bring", ["reflfield.cli"])
-    titles = ("One option at a time", "All views and lights", "Picks of the front")
-    for title, some in zip(titles, rows, strict=True):
-        results.table(title)
-        for row in some:
-            results.add(row)
-    print(results.write())
+        for title, some in zip(TITLES, rows, strict=True):
+            results.table(title)
+            for row in some:
+                results.add(row)
+        print(results.write())
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ def pictures(results):
         ("accuracy", alignment_picture),
         ("factorization", completion_picture),
         ("methods", fit_picture),
-        ("sweeps", sweep_picture),
+        *((name, sweep_picture) for name in by_name if name.startswith("sweep_")),
     ):
         if name in by_name and (picture := draw(by_name[name]["tables"])) is not None:
             drawn[f"{name}.svg"] = picture.decode("utf-8")
