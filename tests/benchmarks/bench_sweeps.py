@@ -7,8 +7,8 @@ Settings are chosen on photographs that make no field, and reported on others; t
 (`reflfield/tradeoff/presets.py`) are chosen from these sweeps. A sweep that is finished in
 SWEEPS, with its budget, is not made again.
 
-Writes results/sweep_NAME.json. The simulated captures are made in SWEEPS; the others are test data,
-looked for in REFLFIELD_DATA, by default ../shared/data, and skipped where absent.
+Writes results/sweep_NAME.json. The simulated captures are made in SWEEPS; the others are test
+data, looked for in REFLFIELD_DATA, by default ../shared/data, and skipped where absent.
 """
 
 from __future__ import annotations
