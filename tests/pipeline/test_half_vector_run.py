@@ -124,7 +124,7 @@ def test_the_hull_stays_where_no_surface_is_asked_for(tiny_capture, tmp_path):
         (5, CompressionOptions(model="auto"), "clustered"),
         (100, CompressionOptions(model="auto"), "half_vector"),
         (100, CompressionOptions(model="auto", fit="grid"), "clustered"),
-        (10_000, CompressionOptions(model="auto"), "clustered"),
+        (10_000, CompressionOptions(model="auto"), "half_vector"),
         (5, CompressionOptions(model="half_vector"), "half_vector"),
     ],
 )
