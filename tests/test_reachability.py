@@ -39,6 +39,7 @@ ALLOWED = {
     ("reflfield/pipeline/cache.py", "blocks_repeated"): "written into the record of a stage",
     ("reflfield/export/blender_scene/build_object.py", "default_value"): "Blender reads it",
     ("reflfield/export/blender_scene/build_object.py", "direction_type"): "Blender reads it",
+    ("reflfield/export/blender_scene/build_object.py", "distribution"): "Blender reads it",
     ("reflfield/export/blender_scene/build_object.py", "interpolation"): "Blender reads it",
     ("reflfield/export/blender_scene/build_object.py", "operation"): "Blender reads it",
     ("reflfield/export/blender_scene/build_object.py", "use_nodes"): "Blender reads it",

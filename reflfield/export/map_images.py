@@ -30,8 +30,9 @@ def widths(maps: MaterialMaps) -> tuple[Doubles, Doubles]:
 
 
 def stretch_turns(maps: MaterialMaps) -> Doubles:
-    """Direction of the stretch from the tangent to the bitangent, 0 to 0.5 turns."""
+    """Stretch as turns about the normal from the tangent, counter-clockwise, 0 to 0.5."""
     x, y = np.moveaxis(maps.anisotropy[..., :2] / 127.5 - 1.0, -1, 0)
+    y = np.where(maps.mirrored, -y, y)
     return np.mod(np.arctan2(y, x) / (2.0 * np.pi), 0.5)
 
 

@@ -57,6 +57,9 @@ class MaterialMaps:
     specular : (height, width, 4) uint8
         sRGB-encoded share of `specular_factor`, and how much of a dielectric's reflection
         there is.
+    mirrored : (height, width) bool
+        Where the texture shows the surface mirrored: turning about the normal from the tangent
+        then leads down the texture.
     base_factor, specular_factor : float
         Largest base colour and specular colour.
     exposure : float
@@ -70,6 +73,7 @@ class MaterialMaps:
     normal: Bytes
     anisotropy: Bytes
     specular: Bytes
+    mirrored: NDArray[np.bool_]
     base_factor: float
     specular_factor: float
     exposure: float
@@ -104,6 +108,11 @@ class TextureFrames:
 
     axes: Doubles
     outward: Doubles
+
+    @property
+    def mirrored(self) -> Bytes:
+        """1 at texels of mirrored charts, (n,)."""
+        return (np.linalg.det(self.axes) < 0.0).astype(np.uint8)
 
     def coordinates(self, world: Doubles) -> Doubles:
         """Coordinates of world vectors, (n, 3)."""
@@ -170,6 +179,7 @@ def material_maps(field: ReflectanceField, atlas: Atlas) -> MaterialMaps:
         normal=images["normal"],
         anisotropy=images["anisotropy"],
         specular=images["specular"],
+        mirrored=filled_texture(field.texel_of_pixel, frames.mirrored[:, None])[..., 0] > 0,
         base_factor=factors["base_factor"],
         specular_factor=factors["specular_factor"],
         exposure=exposure,

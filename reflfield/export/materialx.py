@@ -98,7 +98,8 @@ def _tangent(root: ElementTree.Element) -> str:
         node = ElementTree.SubElement(root, kind, name=f"world_{kind}", type="vector3")
         ElementTree.SubElement(node, "input", name="space", type="string", value="world")
     _image(root, "rotation", "float", closest=True)
-    _product(root, "rotation", "float", 360.0)
+    # MaterialX turns vectors clockwise: its v' = v M is their turn by -M.
+    _product(root, "rotation", "float", -360.0)
     node = ElementTree.SubElement(root, "rotate3d", name="turned_tangent", type="vector3")
     for name, kind, source in (
         ("in", "vector3", "world_tangent"),

@@ -8,6 +8,8 @@ from reflfield.errors import InputError
 from reflfield.export import btf_samples
 from reflfield.export.formats import export_field
 from reflfield.field.evaluation import evaluate
+from reflfield.render.camera_rays import FieldSurface
+from tests.export.btf_hh import missing, read_by_btf_hh
 from tests.synthetic_fields import baked_field, lambert, square_surface
 from tests.viewer.shown_fields import half_vector_field
 
@@ -32,6 +34,31 @@ def test_the_container_shows_the_samples_of_the_field(tmp_path, monkeypatch):
     # Singular values below this share of the largest are left out.
     np.testing.assert_allclose(shown, wanted, rtol=btf_samples._LEAST_SHARE)
     assert read.cosine_included
+
+
+@pytest.mark.reference
+@pytest.mark.skipif(missing() is not None, reason=str(missing()))
+def test_a_reader_of_others_shows_the_samples_of_the_field(tmp_path):
+    """By btf.hh: samples, directions and frames of texels."""
+    field = half_vector_field()
+    export_field(field, tmp_path / "a.btf", "btf")
+    view, light = 60, 130
+    read = read_by_btf_hh(tmp_path / "a.btf", tmp_path, [[view, light]])
+    texel_of_pixel = field.texel_of_pixel
+    texels = texel_of_pixel[texel_of_pixel >= 0]
+    frames = field.local_from_world[texels]
+    views, lights = (
+        np.einsum("j,njk->nk", read.lights[k], frames).astype("f4") for k in (view, light)
+    )
+    wanted = evaluate(field, texels, views, lights)
+    off = np.linalg.norm(read.images[0][texel_of_pixel >= 0] - wanted)
+    # Singular values below this share of the largest are left out.
+    assert off < 2 * btf_samples._LEAST_SHARE * np.linalg.norm(wanted)
+    assert read.cosine_included
+    np.testing.assert_allclose(
+        read.rotations.reshape(-1, 3, 3)[texel_of_pixel.ravel() >= 0],
+        FieldSurface(field).local_from_texture[texels].astype("f4"), rtol=0, atol=0,
+    )  # fmt: skip
 
 
 def test_rotations_are_those_of_the_flat_sample(tmp_path):

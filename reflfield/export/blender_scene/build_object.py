@@ -65,6 +65,7 @@ def make_material(about: dict[str, Any]) -> Any:
     for name, socket in SINGLE_MAPS:
         links.new(image(nodes, name), bsdf.inputs[socket])
     bsdf.inputs["IOR"].default_value = 1.5
+    bsdf.distribution = "GGX"  # as the maps were fitted: without light from facet to facet
     normal = nodes.new("ShaderNodeNormalMap")
     links.new(image(nodes, "normal"), normal.inputs["Color"])
     links.new(normal.outputs["Normal"], bsdf.inputs["Normal"])
