@@ -19,7 +19,6 @@ from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.patch_costs import (
     LARGE_STEP,
     NOISE,
-    NOT_SEEN,
     OUTSIDE,
     REACH,
     SMALL_STEP,
@@ -436,29 +435,3 @@ class TestHardCases:
         for seen in alone.depths(None, "test"):
             assert np.isnan(seen.depth).all()
             assert not seen.confirmed.any()
-
-    def test_not_seen_is_no_brightness(self):
-        assert NOT_SEEN < -1e6
-
-
-def test_facing_is_the_cosine_of_rays_and_normals():
-    made = trimesh.creation.icosphere(5)
-    scene = RayScene(Mesh(np.asarray(made.vertices), np.asarray(made.faces)))
-    camera = Camera.look_at(
-        [0.0, -4.0, 0.0], [0, 0, 0], [0, 0, 1], width=41, height=31, fov_deg=40
-    )
-    cosines = scene.facing(camera, 2)
-    assert cosines.shape == (16, 21)
-    rows, columns = np.mgrid[0:31:2, 0:41:2]
-    origins, rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5)
-    # Distance of each ray from the middle of the unit sphere, and the sine that it is.
-    along = -(origins * rays).sum(axis=1)
-    sine = np.linalg.norm(origins + along[:, None] * rays, axis=1)
-    expected = np.sqrt(np.maximum(1 - sine**2, 0)).reshape(cosines.shape)
-    inside = (sine < 0.97).reshape(cosines.shape)
-    # Triangles of .02 radians: a third of that, where the ray is steep.
-    np.testing.assert_allclose(cosines[inside], expected[inside], atol=0.006)
-    assert np.isnan(cosines[(sine > 1.01).reshape(cosines.shape)]).all()
-    parallel = replace(camera, kind="orthographic", fl_x=20.0, fl_y=20.0)
-    # A ray beside the middle by half a pixel of 1/20.
-    assert scene.facing(parallel)[15, 20] == pytest.approx(1.0, abs=0.005)
