@@ -16,7 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.errors import InputError
-from reflfield.field.half_vector import evaluate_half_vector, sum_half_vector_lights
+from reflfield.field.half_vector_evaluation import (
+    evaluate_half_vector,
+    sum_half_vector_lights,
+)
 from reflfield.field.quantisation import check_finite
 from reflfield.field.reflectance_field import (
     ClusteredField,
@@ -30,12 +33,23 @@ from reflfield.util.validation import UNIT_TOLERANCE, check_shape
 # Kernel helpers are typed by numba; to mypy their scalars are Any.
 
 
+# Whole arrays and indices are passed on: a part of an array is an object whose references are
+# counted, which takes longer than the taps do.
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _in_frame(frames: Any, t: Any, axis: int, directions: Any, i: Any) -> Any:
+    """One coordinate of direction i in the frame of texel t."""
+    x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+    return frames[t, axis, 0] * x + frames[t, axis, 1] * y + frames[t, axis, 2] * z
+
+
 @numba.njit(cache=True, nogil=True)
-def _local_taps(frame: Any, direction: Any, side: int) -> Any:
+def _local_taps(frames: Any, t: Any, directions: Any, i: Any, side: int) -> Any:
     """First node, steps to the next column and row, shares of those, local z."""
-    x = frame[0, 0] * direction[0] + frame[0, 1] * direction[1] + frame[0, 2] * direction[2]
-    y = frame[1, 0] * direction[0] + frame[1, 1] * direction[1] + frame[1, 2] * direction[2]
-    z = frame[2, 0] * direction[0] + frame[2, 1] * direction[1] + frame[2, 2] * direction[2]
+    x = _in_frame(frames, t, 0, directions, i)
+    y = _in_frame(frames, t, 1, directions, i)
+    z = _in_frame(frames, t, 2, directions, i)
     if side == 1:
         # One node four times, and no horizon: the direction does not vary.
         return 0, 0, 0, np.float32(0.0), np.float32(0.0), np.float32(1.0)
@@ -66,17 +80,16 @@ def _inverse_domain(value: Any, power: int) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_taps(nodes: Any, view_taps: Any, light_taps: Any, tap_sum: Any) -> None:
-    """Add the 16 taps of all components and channels to `tap_sum`."""
+def _sum_taps(table: Any, c: Any, view_taps: Any, light_taps: Any, tap_sum: Any) -> None:
+    """Sum of the 16 taps in cluster c of all components and channels, into `tap_sum`."""
+    tap_sum[:] = np.float32(0.0)
     for a in range(4):
         view_node, view_weight = _corner(a, view_taps)
         for b in range(4):
             light_node, light_weight = _corner(b, light_taps)
             weight = view_weight * light_weight
-            tap = nodes[view_node, light_node]
-            for k in range(tap.shape[0]):
-                for channel in range(3):
-                    tap_sum[k, channel] += weight * tap[k, channel]
+            for i in range(len(tap_sum)):
+                tap_sum[i] += weight * table[c, view_node, light_node, i]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -92,22 +105,23 @@ def _evaluate(
     lights: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    tap_sum = np.zeros((table.shape[3], 3), np.float32)
+    n_components = component_weights.shape[1]
+    tap_sum = np.zeros(3 * n_components, np.float32)
+    nodes = table.reshape((table.shape[0], table.shape[1], table.shape[2], 3 * n_components))
     for i in range(len(texels)):
         texel = texels[i]
         if texel < 0:
             continue
-        view_taps = _local_taps(local_from_world[texel], views[i], sides[0])
-        light_taps = _local_taps(local_from_world[texel], lights[i], sides[1])
+        view_taps = _local_taps(local_from_world, texel, views, i, sides[0])
+        light_taps = _local_taps(local_from_world, texel, lights, i, sides[1])
         cosine = np.float32(softened_cosine_of(light_taps[5]))
         if cosine == 0.0:
             continue
-        tap_sum[:] = 0.0
-        _add_taps(table[cluster[texel]], view_taps, light_taps, tap_sum)
+        _sum_taps(nodes, cluster[texel], view_taps, light_taps, tap_sum)
         for channel in range(3):
             value = np.float32(0.0)
-            for k in range(tap_sum.shape[0]):
-                value += component_weights[texel, k] * tap_sum[k, channel]
+            for k in range(n_components):
+                value += component_weights[texel, k] * tap_sum[3 * k + channel]
             out[i, channel] = cosine * _inverse_domain(value, power)
 
 
@@ -126,7 +140,7 @@ def _light_response(
         texel = texels[i]
         if texel < 0:
             continue
-        taps = _local_taps(local_from_world[texel], views[i], view_side)
+        taps = _local_taps(local_from_world, texel, views, i, view_side)
         for a in range(4):
             view_node, corner = _corner(a, taps)
             nodes = table[cluster[texel], view_node]
@@ -156,7 +170,7 @@ def _sum_lights(
         for j in range(len(lights)):
             if not lit[i % len(lit), j]:
                 continue
-            taps = _local_taps(local_from_world[texel], lights[j], light_side)
+            taps = _local_taps(local_from_world, texel, lights, j, light_side)
             cosine = np.float32(softened_cosine_of(taps[5]))
             if cosine == 0.0:
                 continue

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from reflfield.field.half_vector import evaluate_half_vector
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
 from reflfield.field.quantisation import codes_from_rotations, rotations_from_codes
 from reflfield.fitting.image_fit import image_step, pixel_rows
 from reflfield.fitting.pixel_system import ViewPixels

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
 from reflfield.field.half_vector import HalfVectorModel
+from reflfield.fitting.pixel_kernels import N_ROTATIONS
 from reflfield.fitting.pixel_system import (
-    N_ROTATIONS,
     PixelStart,
     ViewPixels,
     linearisation_shapes,

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,16 +18,16 @@ from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import MEASURED, SATURATED
 from reflfield.capture.lights import Light
-from reflfield.field.half_vector import (
-    FAST,
-    HalfVectorModel,
-    add_sample,
-    diffuse_value,
-    half_taps,
-    lobe_values,
-    rotated,
+from reflfield.field.half_vector import HalfVectorModel
+from reflfield.fitting.pixel_kernels import (
+    N_ROTATIONS,
+    add_to_unknowns,
+    derive,
+    mark_used,
+    start_step,
+    texels_shown,
+    weigh_through_pixels,
 )
-from reflfield.fitting.robust_weights import HUBER, is_evidence, squared_weight
 from reflfield.observations.image_projection import facing_irradiance
 from reflfield.render.camera_rays import FieldSurface, subpixel_offsets
 
@@ -42,11 +41,6 @@ RAYS_PER_PIXEL = 9
 LEAST_COVERAGE = 0.99
 # A pixel that shows texels at a smaller cosine with more than so much of its area is left out.
 GRAZING_COSINE, GRAZING_SHARE = 0.12, 0.05
-# Half of the step by which rotations are differenced, radians: highlights are a few degrees
-# wide, and the tables bilinear between nodes a degree apart.
-HALF_ANGLE = np.float32(0.008)
-# Rotations about the texel's own axes: two tilts and the turn about the normal.
-N_ROTATIONS = 3
 PIXELS_AT_ONCE = 4096
 
 
@@ -257,164 +251,20 @@ class Linearisation:
     ----------
     diffuse : (m, n_lights) float32
         By the diffuse colour, the same for all channels.
-    lobes : (m, n_lights, K, 3) float32
-    rotations : (m, n_lights, 3, 3) float32
-        By rotations about the texel's axes; channels last.
+    others : (m, K + 3, n_lights, 3) float32
+        By the weights of the lobes, then by rotations about the texel's axes; channels last.
     weight : (n_pixels, n_lights, 3) float32
         Of the squared residual of each value; 0 where it does not count.
     """
 
     diffuse: Floats
-    lobes: Floats
-    rotations: Floats
+    others: Floats
     weight: Floats
 
     @property
-    def arrays(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """As kernels take them."""
-        return self.diffuse, self.lobes, self.rotations, self.weight
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _used_entries(geometry: Any, values: Any, used: Any) -> None:
-    """Mark the texels and lights (m, n_lights) that some value needs."""
-    first, entry, _ = geometry
-    for pixel in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            if not np.isnan(values[pixel, j]).all():
-                for e in range(first[pixel], first[pixel + 1]):
-                    used[entry[e], j] = True
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _derivatives(texels: Any, views: Any, lights: Any, used: Any, model: Any, out: Any) -> None:
-    frames, diffuse, weights, lobes, table = model
-    by_diffuse, by_lobes, by_rotations = out
-    frame = np.zeros((2 * N_ROTATIONS, 3, 3), np.float32)
-    ahead, behind = np.zeros(3, np.float32), np.zeros(3, np.float32)
-    for row in range(len(texels)):
-        t = texels[row]
-        for r in range(N_ROTATIONS):
-            rotated(frames[t], r, HALF_ANGLE, frame[2 * r])
-            rotated(frames[t], r, -HALF_ANGLE, frame[2 * r + 1])
-        for j in range(lights.shape[1]):
-            if not used[row, j]:
-                continue
-            view, light = views[row], lights[row, j]
-            at_lobe, at_diffuse, cosine, spread = half_taps(frames[t], view, light)
-            by_diffuse[row, j] = cosine * diffuse_value(table, at_diffuse)
-            lobe_values(lobes, at_lobe, cosine * spread, by_lobes[row, j])
-            for r in range(N_ROTATIONS):
-                ahead[:] = np.float32(0.0)
-                behind[:] = np.float32(0.0)
-                tables = (lobes, table)
-                add_sample(frame[2 * r], view, light, diffuse[t], weights[t], tables, ahead)
-                add_sample(
-                    frame[2 * r + 1], view, light, diffuse[t], weights[t], tables, behind
-                )
-                for c in range(3):
-                    by_rotations[row, j, r, c] = (ahead[c] - behind[c]) / (2 * HALF_ANGLE)
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _pixel_value(pixel: Any, j: int, geometry: Any, x: Any, system: Any, out: Any) -> None:
-    """A x at one pixel and light, into `out` (3,); x (m, 3 + K + 3)."""
-    first, entry, share = geometry
-    by_diffuse, by_lobes, by_rotations, _ = system
-    n_lobes = by_lobes.shape[2]
-    out[:] = np.float32(0.0)
-    for e in range(first[pixel], first[pixel + 1]):
-        row = entry[e]
-        for c in range(3):
-            value = x[row, c] * by_diffuse[row, j]
-            for k in range(n_lobes):
-                value += x[row, 3 + k] * by_lobes[row, j, k, c]
-            for r in range(N_ROTATIONS):
-                value += x[row, 3 + n_lobes + r] * by_rotations[row, j, r, c]
-            out[c] += share[e] * value
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _add_adjoint(pixel: Any, j: int, geometry: Any, residual: Any, system: Any, y: Any) -> None:
-    """Add A^T of a residual (3,) at one pixel and light to y (m, 3 + K + 3)."""
-    first, entry, share = geometry
-    by_diffuse, by_lobes, by_rotations, _ = system
-    n_lobes = by_lobes.shape[2]
-    for e in range(first[pixel], first[pixel + 1]):
-        row = entry[e]
-        for c in range(3):
-            part = share[e] * residual[c]
-            y[row, c] += part * by_diffuse[row, j]
-            for k in range(n_lobes):
-                y[row, 3 + k] += part * by_lobes[row, j, k, c]
-            for r in range(N_ROTATIONS):
-                y[row, 3 + n_lobes + r] += part * by_rotations[row, j, r, c]
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _apply(geometry: Any, values: Any, x: Any, system: Any, y: Any) -> None:
-    """Y += A^T W A x."""
-    shown, weight = np.zeros(3, np.float32), system[3]
-    for pixel in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            if weight[pixel, j, 0] + weight[pixel, j, 1] + weight[pixel, j, 2] == 0:
-                continue
-            _pixel_value(pixel, j, geometry, x, system, shown)
-            for c in range(3):
-                shown[c] *= weight[pixel, j, c]
-            _add_adjoint(pixel, j, geometry, shown, system, y)
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _add_diagonal(pixel: Any, j: int, geometry: Any, system: Any, diagonal: Any) -> None:
-    """Add the squares of one pixel's derivatives, weighted, to the diagonal."""
-    first, entry, share = geometry
-    by_diffuse, by_lobes, by_rotations, weight = system
-    n_lobes = by_lobes.shape[2]
-    for e in range(first[pixel], first[pixel + 1]):
-        row = entry[e]
-        for c in range(3):
-            w = share[e] * share[e] * weight[pixel, j, c]
-            diagonal[row, c] += w * by_diffuse[row, j] ** 2
-            for k in range(n_lobes):
-                diagonal[row, 3 + k] += w * by_lobes[row, j, k, c] ** 2
-            for r in range(N_ROTATIONS):
-                diagonal[row, 3 + n_lobes + r] += w * by_rotations[row, j, r, c] ** 2
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _weigh(values: Any, at_least: Any, shown: Any, weight: Any) -> Any:
-    """Weights of one pixel's channels; `shown` becomes the weighted residual; its square."""
-    error = 0.0
-    for c in range(3):
-        weight[c] = np.float32(0.0)
-        residual = np.float32(0.0)
-        if is_evidence(values[c], at_least[c], shown[c]):
-            weight[c] = squared_weight(values[c], shown[c], HUBER)
-            residual = values[c] - shown[c]
-            error += weight[c] * residual * residual
-        shown[c] = weight[c] * residual
-    return error
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _start(geometry: Any, observed: Any, x: Any, system: Any, right: Any, diagonal: Any) -> Any:
-    """Weights of values from residuals at x; right side, diagonal; sum of squares, count."""
-    weight = system[3]
-    values, at_least = observed
-    residual = np.zeros(3, np.float32)
-    error, count = 0.0, 0
-    for pixel in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            if np.isnan(values[pixel, j]).all():
-                continue
-            _pixel_value(pixel, j, geometry, x, system, residual)
-            error += _weigh(values[pixel, j], at_least[pixel, j], residual, weight[pixel, j])
-            for c in range(3):
-                count += weight[pixel, j, c] > 0
-            _add_adjoint(pixel, j, geometry, residual, system, right)
-            _add_diagonal(pixel, j, geometry, system, diagonal)
-    return error, count
+    def by_unknowns(self) -> tuple[Floats, Floats]:
+        """Derivatives as the kernels of products take them, lights and channels as one."""
+        return self.diffuse, self.others.reshape(*self.others.shape[:2], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,6 +292,17 @@ def _geometry(pixels: ViewPixels) -> tuple[Any, Any, Any]:
     return pixels.first, pixels.entry, pixels.share
 
 
+def _of_lights(values: NDArray[Any]) -> NDArray[Any]:
+    """Lights and channels as one axis."""
+    return values.reshape(len(values), values.shape[1] * 3)
+
+
+def _zeros_of_texels(system: Linearisation) -> Floats:
+    """One number of each texel, light and channel, (m, n_lights * 3)."""
+    m, n_lights = system.diffuse.shape
+    return np.zeros((m, 3 * n_lights), np.float32)
+
+
 def linearised(
     pixels: ViewPixels, model: HalfVectorModel, arrays: Sequence[Floats]
 ) -> PixelStart:
@@ -452,31 +313,39 @@ def linearised(
     pixels : ViewPixels
     model : HalfVectorModel
     arrays : sequence of ndarray
-        Of `Linearisation`, written in place; shapes by `linearisation_shapes`.
+        Of `Linearisation`, zero, written in place; shapes by `linearisation_shapes`.
     """
     system = Linearisation(*arrays)
     used = np.zeros(pixels.lights.shape[:2], np.bool_)
-    _used_entries(_geometry(pixels), pixels.values, used)
-    directions = (pixels.views, pixels.lights)
-    _derivatives(pixels.texels, *directions, used, model.arrays, system.arrays[:3])
+    mark_used(_geometry(pixels), pixels.values, used)
+    by_unknowns = (system.diffuse, system.others)
+    derive(pixels.texels, pixels.views, pixels.lights, used, model.arrays, by_unknowns)
     x = np.zeros((len(pixels.texels), 3 + model.n_lobes + N_ROTATIONS), np.float32)
     x[:, :3] = model.diffuse[pixels.texels]
     x[:, 3 : 3 + model.n_lobes] = model.weights[pixels.texels]
+    shown, residuals, squares = (_zeros_of_texels(system) for _ in range(3))
+    texels_shown(x, *system.by_unknowns, shown)
+    observed = _of_lights(pixels.values), _of_lights(pixels.at_least)
+    error, count = start_step(
+        _geometry(pixels), observed, shown, _of_lights(system.weight), (residuals, squares)
+    )
     right, diagonal = np.zeros_like(x), np.zeros_like(x)
-    system.weight[:] = 0
-    observed = (pixels.values, pixels.at_least)
-    squares, count = _start(_geometry(pixels), observed, x, system.arrays, right, diagonal)
-    return PixelStart(system, right, diagonal, squares, count)
+    add_to_unknowns(residuals, *system.by_unknowns, 1, right)
+    add_to_unknowns(squares, *system.by_unknowns, 2, diagonal)
+    return PixelStart(system, right, diagonal, error, count)
 
 
 def linearisation_shapes(pixels: ViewPixels, n_lobes: int) -> tuple[tuple[int, ...], ...]:
     """Shapes of the arrays of a `Linearisation`."""
     m, n = pixels.lights.shape[:2]
-    return (m, n), (m, n, n_lobes, 3), (m, n, N_ROTATIONS, 3), pixels.values.shape
+    return (m, n), (m, n_lobes + N_ROTATIONS, n, 3), pixels.values.shape
 
 
 def normal_product(pixels: ViewPixels, system: Linearisation, x: Floats) -> Floats:
     """A^T W A x of one view, (m, 3 + K + 3) float32."""
+    shown, weighed = _zeros_of_texels(system), _zeros_of_texels(system)
+    texels_shown(x, *system.by_unknowns, shown)
+    weigh_through_pixels(_geometry(pixels), _of_lights(system.weight), shown, weighed)
     y = np.zeros_like(x)
-    _apply(_geometry(pixels), pixels.values, x, system.arrays, y)
+    add_to_unknowns(weighed, *system.by_unknowns, 1, y)
     return y

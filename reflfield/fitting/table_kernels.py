@@ -10,29 +10,70 @@ from typing import Any
 import numba
 import numpy as np
 
-from reflfield.field.half_vector import (
-    FAST,
-    HALF_SIDE,
-    N_LIGHT,
-    N_VIEW,
-    SKEW_RINGS,
-    diffuse_value,
-    half_taps,
-    lobe_values,
-    skewed,
+from reflfield.field.half_vector import HALF_SIDE, N_LIGHT, N_VIEW, SKEW_RINGS
+from reflfield.field.half_vector_batches import (
+    AZIMUTH,
+    BATCH,
+    COSINE,
+    LOBE,
+    LOBE_NODE,
+    RING,
+    SKEW_NODE,
+    SPREAD,
+    TABLE,
+    TABLE_NODE,
+    empty_batch,
+    place_batch,
+    put_pairs,
+    sample_at,
+    skew_at,
+    skew_place,
 )
 from reflfield.fitting.robust_weights import TABLE_HUBER, is_evidence, squared_weight
+from reflfield.util.single_precision import FAST
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _skew_factors(skews: Any, taps: Any, spread: Any, factor: Any) -> None:
-    """Factors of the lobes of an entry, channel by channel, after that of the diffuse part."""
+@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _keep_place(e: Any, i: Any, batch: Any, taps: Any) -> None:
+    """Nodes and shares of entry e, which is pair i of a batch."""
+    numbers, nodes = batch
+    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
+    lobe_node[e], diffuse_node[e] = nodes[LOBE_NODE + i], nodes[TABLE_NODE + i]
+    for d in range(3):
+        lobe_share[e, d] = numbers[LOBE + BATCH * d + i]
+        diffuse_share[e, d] = numbers[TABLE + BATCH * d + i]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _keep_factors(
+    e: Any, i: Any, share: Any, batch: Any, skews: Any, rings: Any, factor: Any
+) -> None:
+    """Factors of entry e: of the diffuse part, then of the channels of the lobes."""
+    numbers, nodes = batch
+    ring_node, ring_share, spread = rings
+    ring_node[e] = nodes[SKEW_NODE + i]
+    ring_share[e, 0], ring_share[e, 1] = numbers[RING + i], numbers[AZIMUTH + i]
+    factor[e, 0] = share * numbers[COSINE + i]
+    spread[e] = factor[e, 0] * numbers[SPREAD + i]
+    place = skew_place(i, batch)
     for k in range(skews.shape[0]):
         for c in range(3):
-            factor[1 + 3 * k + c] = spread * skewed(skews[k], taps, c)
+            factor[e, 1 + 3 * k + c] = spread[e] * skew_at(place, skews, k, c)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _weigh_rows(observed: Any, weight: Any) -> None:
+    """Weights of values where `weight` holds what the model shows."""
+    values, at_least = observed
+    for row in range(values.shape[0]):
+        for c in range(3):
+            shown = weight[row, c]
+            w = squared_weight(values[row, c], shown, TABLE_HUBER)
+            counts = is_evidence(values[row, c], at_least[row, c], shown)
+            weight[row, c] = w if counts else np.float32(0.0)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def linearise_rows(
     first: Any,
     texel: Any,
@@ -46,34 +87,24 @@ def linearise_rows(
     factor: Any,
     weight: Any,
 ) -> None:
-    """Taps and factors of entries; weights from the residuals of the model as it is."""
+    """Taps and factors of entries; weights (zero before) from residuals of the model."""
     frames, diffuse, weights, lobes, table = model
-    lobe_node, lobe_share, diffuse_node, diffuse_share = taps
-    ring_node, ring_share, spread_of = rings
-    part = np.zeros((weights.shape[1], 3), np.float32)
-    shown = np.zeros(3, np.float32)
-    values, at_least = observed
-    for row in range(len(values)):
-        shown[:] = np.float32(0.0)
-        for e in range(first[row], first[row + 1]):
-            t = texel[e]
-            at_lobe, at_diffuse, cosine, spread = half_taps(frames[t], views[e], lights[e])
-            lobe_node[e], fx, fy, fd, ring_node[e], ring_share[e, 0], ring_share[e, 1] = at_lobe
-            lobe_share[e, 0], lobe_share[e, 1], lobe_share[e, 2] = fx, fy, fd
-            diffuse_node[e], gl, gv, gp = at_diffuse
-            diffuse_share[e, 0], diffuse_share[e, 1], diffuse_share[e, 2] = gl, gv, gp
-            factor[e, 0] = share[e] * cosine
-            spread_of[e] = share[e] * cosine * spread
-            _skew_factors(lobes[1], at_lobe, spread_of[e], factor[e])
-            base = factor[e, 0] * diffuse_value(table, at_diffuse)
-            lobe_values(lobes, at_lobe, spread_of[e], part)
-            for c in range(3):
-                shown[c] += base * diffuse[t, c]
-                for k in range(weights.shape[1]):
-                    shown[c] += weights[t, k] * part[k, c]
-        for c in range(3):
-            if is_evidence(values[row, c], at_least[row, c], shown[c]):
-                weight[row, c] = squared_weight(values[row, c], shown[c], TABLE_HUBER)
+    batch, row = empty_batch(), 0
+    for begin in range(first[0], first[-1], BATCH):
+        n = min(BATCH, first[-1] - begin)
+        put_pairs(begin, n, texel, frames, views, lights, batch)
+        place_batch(batch)
+        for i in range(n):
+            e = begin + i
+            while e >= first[row + 1]:
+                row += 1
+            _keep_place(e, i, batch, taps)
+            _keep_factors(e, i, share[e], batch, lobes[1], rings, factor)
+            red, green, blue = sample_at(i, batch, texel[e], (diffuse, weights), (lobes, table))
+            weight[row, 0] += share[e] * red
+            weight[row, 1] += share[e] * green
+            weight[row, 2] += share[e] * blue
+    _weigh_rows(observed, weight)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)

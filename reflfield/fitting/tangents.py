@@ -17,16 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
-from reflfield.field.half_vector import (
-    FAST,
-    HalfVectorModel,
-    diffuse_value,
-    half_taps,
-    lobe_values,
+from reflfield.field.half_vector import HalfVectorModel
+from reflfield.field.half_vector_batches import (
+    BATCH,
+    COSINE,
+    LIGHT,
+    VIEW,
+    diffuse_at,
+    empty_batch,
+    lobes_into,
 )
 from reflfield.fitting.robust_weights import HUBER, squared_weight
 from reflfield.fitting.texel_graph import TexelGraph
-from reflfield.fitting.texel_sample_fit import Indices, SampleBlock, SampleBlocks
+from reflfield.fitting.texel_sample_fit import (
+    Indices,
+    SampleBlock,
+    SampleBlocks,
+    place_samples,
+)
+from reflfield.util.single_precision import FAST
 
 Floats = NDArray[np.float32]
 
@@ -38,42 +47,58 @@ SMOOTHING = 6
 LEAST_INFORMATION = 1e-6
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _azimuth(i: Any, batch: Any) -> Any:
+    """Cosine and sine, times u, of twice the azimuth of the half vector of pair i."""
+    numbers = batch[0]
+    x = numbers[LIGHT + i] + numbers[VIEW + i]
+    y = numbers[LIGHT + BATCH + i] + numbers[VIEW + BATCH + i]
+    z = numbers[LIGHT + 2 * BATCH + i] + numbers[VIEW + 2 * BATCH + i]
+    square = x * x + y * y + z * z
+    sine2 = (x * x + y * y) / square + np.float32(1e-9)
+    scale = np.float32(1.0) / (square * (sine2 + FULL_AZIMUTH))
+    return (x * x - y * y) * scale, np.float32(2.0) * x * y * scale
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _add_sample(
+    row: Any, t: Any, value: Any, c: Any, base: Any, lobes: Any, of_model: Any, out: Any
+) -> None:
+    """Add one channel of a sample; `lobes` are what it shows of each, and the azimuth."""
+    part, (cos2, sin2) = lobes
+    diffuse, weights, best = of_model
+    shown = diffuse[t, c] * base
+    for k in range(weights.shape[1]):
+        shown += weights[t, k] * part[k, c]
+    lobe = weights[t, best] * part[best, c]
+    factor = squared_weight(value, shown, HUBER) * lobe
+    out[row, 0] += factor * lobe * cos2 * cos2
+    out[row, 1] += factor * lobe * cos2 * sin2
+    out[row, 2] += factor * lobe * sin2 * sin2
+    out[row, 3] += factor * cos2 * (value - shown)
+    out[row, 4] += factor * sin2 * (value - shown)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _moments(block: Any, texels: Any, model: Any, best: int, out: Any) -> None:
     """Normal equations (3 of the matrix, 2 of the right side) of each texel's two numbers."""
-    first, view, light, values, views, lights = block
+    first, values = block[0], block[3]
     frames, diffuse, weights, lobes, table = model
-    part = np.zeros((weights.shape[1], 3), np.float32)
+    batch, part = empty_batch(), np.zeros((weights.shape[1], 3), np.float32)
+    of_model = (diffuse, weights, best)
     for row in range(len(texels)):
         t = texels[row]
-        frame = frames[t]
-        for s in range(first[row], first[row + 1]):
-            v, w = views[row, view[s]], lights[row, light[s]]
-            at_lobe, at_diffuse, cosine, spread = half_taps(frame, v, w)
-            base = cosine * diffuse_value(table, at_diffuse)
-            lobe_values(lobes, at_lobe, cosine * spread, part)
-            x, y, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for d in range(3):
-                h = v[d] + w[d]
-                square += h * h
-                x += frame[0, d] * h
-                y += frame[1, d] * h
-            sine2 = (x * x + y * y) / square + np.float32(1e-9)
-            azimuth = np.float32(1.0) / (square * (sine2 + FULL_AZIMUTH))
-            cos2, sin2 = (x * x - y * y) * azimuth, np.float32(2.0) * x * y * azimuth
-            for c in range(3):
-                if np.isnan(values[s, c]):
-                    continue
-                shown = diffuse[t, c] * base
-                for k in range(weights.shape[1]):
-                    shown += weights[t, k] * part[k, c]
-                lobe = weights[t, best] * part[best, c]
-                factor = squared_weight(values[s, c], shown, HUBER) * lobe
-                out[row, 0] += factor * lobe * cos2 * cos2
-                out[row, 1] += factor * lobe * cos2 * sin2
-                out[row, 2] += factor * lobe * sin2 * sin2
-                out[row, 3] += factor * cos2 * (values[s, c] - shown)
-                out[row, 4] += factor * sin2 * (values[s, c] - shown)
+        for begin in range(first[row], first[row + 1], BATCH):
+            n = min(BATCH, first[row + 1] - begin)
+            place_samples(begin, n, row, t, block, frames, batch)
+            for i in range(n):
+                base = batch[0][COSINE + i] * diffuse_at(i, batch, table)
+                lobes_into(part, i, batch, lobes)
+                shown = (part, _azimuth(i, batch))
+                for c in range(3):
+                    value = values[begin + i, c]
+                    if not np.isnan(value):
+                        _add_sample(row, t, value, c, base, shown, of_model, out)
 
 
 def with_tangents_along_highlights(

@@ -13,19 +13,27 @@ from numpy.typing import NDArray
 
 from reflfield.field.half_vector import (
     DIFFUSE_NODES,
-    FAST,
     N_DIFFERENCE,
     SKEW_NODES,
     HalfVectorModel,
-    diffuse_value,
     half_angles,
-    half_taps,
-    lobe_values,
+)
+from reflfield.field.half_vector_batches import (
+    BATCH,
+    COSINE,
+    LIGHT,
+    VIEW,
+    diffuse_at,
+    empty_batch,
+    lobes_into,
+    place_batch,
+    put_direction,
 )
 from reflfield.fitting.robust_weights import HUBER, squared_weight
 from reflfield.fitting.table_fit import TableRows, fit_tables
 from reflfield.observations.texel_samples import TexelSamples
 from reflfield.util.cholesky import cholesky_factor, solve_vector
+from reflfield.util.single_precision import FAST
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -178,37 +186,65 @@ class SampleBlocks:
         return list(pool.map(lambda n: function(self[n]), range(self.n_blocks)))
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def place_samples(
+    first: Any, n: Any, row: Any, texel: Any, block: Any, frames: Any, batch: Any
+) -> None:
+    """Place samples `first` to `first + n` of a block, all of one texel, in the tables."""
+    _, view, light, _, views, lights = block
+    numbers = batch[0]
+    for i in range(n):
+        v, w = view[first + i], light[first + i]
+        towards = (lights[row, w, 0], lights[row, w, 1], lights[row, w, 2])
+        put_direction(numbers, LIGHT + i, frames, texel, towards)
+        towards = (views[row, v, 0], views[row, v, 1], views[row, v, 2])
+        put_direction(numbers, VIEW + i, frames, texel, towards)
+    place_batch(batch)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _add_channel(
+    c: Any, y: Any, texel: Any, base: Any, part: Any, of_texels: Any, system: Any
+) -> Any:
+    """Add one channel of a sample to normal equations; its weighted squared error."""
+    diffuse, weights = of_texels
+    normal, right = system
+    n_lobes = weights.shape[1]
+    shown = diffuse[texel, c] * base
+    for k in range(n_lobes):
+        shown += weights[texel, k] * part[k, c]
+    w = squared_weight(y, shown, HUBER)
+    right[c] += w * base * y
+    normal[c, c] += w * base * base
+    for k in range(n_lobes):
+        right[3 + k] += w * part[k, c] * y
+        normal[c, 3 + k] += w * base * part[k, c]
+        for other in range(k, n_lobes):
+            normal[3 + k, 3 + other] += w * part[k, c] * part[other, c]
+    return w * (y - shown) ** 2
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _sums_of_texel(
-    block: Any, row: int, texel: int, model: Any, normal: Any, right: Any, part: Any
+    block: Any, row: Any, texel: Any, model: Any, system: Any, scratch: Any
 ) -> Any:
     """Normal equations of one texel's coefficients; weighted squares and their number."""
-    first, view, light, values, views, lights = block
+    first, values = block[0], block[3]
     frames, diffuse, weights, lobes, table = model
-    n_lobes, error, count = weights.shape[1], 0.0, 0
-    for s in range(first[row], first[row + 1]):
-        at_lobe, at_diffuse, cosine, spread = half_taps(
-            frames[texel], views[row, view[s]], lights[row, light[s]]
-        )
-        base = cosine * diffuse_value(table, at_diffuse)
-        lobe_values(lobes, at_lobe, cosine * spread, part)
-        for c in range(3):
-            y = values[s, c]
-            if np.isnan(y):
-                continue
-            shown = diffuse[texel, c] * base
-            for k in range(n_lobes):
-                shown += weights[texel, k] * part[k, c]
-            w = squared_weight(y, shown, HUBER)
-            error += w * (y - shown) ** 2
-            count += 1
-            right[c] += w * base * y
-            normal[c, c] += w * base * base
-            for k in range(n_lobes):
-                right[3 + k] += w * part[k, c] * y
-                normal[c, 3 + k] += w * base * part[k, c]
-                for other in range(k, n_lobes):
-                    normal[3 + k, 3 + other] += w * part[k, c] * part[other, c]
+    batch, part = scratch
+    error, count = 0.0, 0
+    for begin in range(first[row], first[row + 1], BATCH):
+        n = min(BATCH, first[row + 1] - begin)
+        place_samples(begin, n, row, texel, block, frames, batch)
+        for i in range(n):
+            base = batch[0][COSINE + i] * diffuse_at(i, batch, table)
+            lobes_into(part, i, batch, lobes)
+            for c in range(3):
+                y = values[begin + i, c]
+                if not np.isnan(y):
+                    of_texels = (diffuse, weights)
+                    error += _add_channel(c, y, texel, base, part, of_texels, system)
+                    count += 1
     return error, count
 
 
@@ -250,13 +286,13 @@ def _solve_texels(
 ) -> Any:
     """Coefficients (n, 3 + K) of texels; the weighted squared error before, and its count."""
     n_lobes = model[2].shape[1]
-    part = np.zeros((n_lobes, 3), np.float32)
+    scratch = empty_batch(), np.zeros((n_lobes, 3), np.float32)
     normal, right = np.zeros((3 + n_lobes, 3 + n_lobes)), np.zeros(3 + n_lobes)
     error, count = 0.0, 0
     for row in range(len(texels)):
         normal[:] = 0.0
         right[:] = 0.0
-        of_texel = _sums_of_texel(block, row, texels[row], model, normal, right, part)
+        of_texel = _sums_of_texel(block, row, texels[row], model, (normal, right), scratch)
         error += of_texel[0]
         count += of_texel[1]
         for x in range(len(right)):

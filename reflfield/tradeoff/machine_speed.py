@@ -8,7 +8,7 @@ from statistics import median
 
 import numpy as np
 
-from reflfield.field.half_vector import evaluate_half_vector
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
 from reflfield.fitting.texel_sample_fit import start_model
 from reflfield.util.progress import track
 

@@ -45,7 +45,7 @@ KERNELS = {
     "costs over paths": (search_kernels.paths, 240, 12),
 }
 MODULES = [
-    "reflfield.fitting.pixel_system",
+    "reflfield.fitting.pixel_kernels",
     "reflfield.fitting.table_fit",
     "reflfield.field.evaluation",
     "reflfield.alignment.newton_ascent",

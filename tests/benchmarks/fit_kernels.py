@@ -15,13 +15,12 @@ from benchmarks.roofline import DIVISION, FUNCTION, ROOT, Kernel, size
 from scipy.interpolate import RegularGridInterpolator
 
 from reflfield.field.evaluation import _evaluate
-from reflfield.field.half_vector import HALF_SIDE, N_LIGHT, N_VIEW, evaluate_half_vector
+from reflfield.field.half_vector import HALF_SIDE, N_LIGHT, N_VIEW
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
+from reflfield.fitting.pixel_kernels import HALF_ANGLE, N_ROTATIONS, derive
 from reflfield.fitting.pixel_system import (
-    HALF_ANGLE,
-    N_ROTATIONS,
     Linearisation,
     ViewPixels,
-    _derivatives,
     linearisation_shapes,
     normal_product,
 )
@@ -84,11 +83,12 @@ def linearisation(n_pixels, seed):
     pixels, model = view_of(np.random.default_rng(seed), n_pixels)
     shapes = linearisation_shapes(pixels, N_LOBES)
     used = np.ones(shapes[0], np.bool_)
-    out = tuple(np.zeros(shape, np.float32) for shape in shapes[:3])
+    out = tuple(np.zeros(shape, np.float32) for shape in shapes[:2])
     inputs = (pixels.texels, pixels.views, pixels.lights, used, model.arrays)
 
     def work():
-        _derivatives(*inputs, out)
+        out[1][:] = 0
+        derive(*inputs, out)
         return out
 
     # The sample's own derivatives with two factors, six samples in rotated frames, and 2 for
@@ -125,7 +125,7 @@ def differenced(pixels, model):
         for r in range(N_ROTATIONS)
     ]
     by_diffuse = samples(diffuse=white, weights=none)[..., 0]
-    return by_diffuse, np.stack(by_lobes, axis=2), np.stack(by_rotations, axis=2)
+    return by_diffuse, np.stack(by_lobes + by_rotations, axis=1)
 
 
 def turned(model, axis, sign):
@@ -153,7 +153,7 @@ def pixel_product(n_pixels, seed):
         precision="float32",
         n_items=pixels.entry.size * N_PHOTOGRAPHS,
         operations=2 * 3 * channel + 5 / UNDER_PIXEL,
-        bytes_read=size(*system.arrays, *indices, x, x),
+        bytes_read=size(system.diffuse, system.others, system.weight, *indices, x, x),
         bytes_written=x.nbytes,
         work=lambda: (normal_product(pixels, system, x),),
         reference=lambda: (dense_product(pixels, system, x),),
@@ -163,7 +163,7 @@ def pixel_product(n_pixels, seed):
 def dense_product(pixels, system, x):
     """The same over whole arrays."""
     by_diffuse, weight, x = (a.astype(np.float64) for a in (system.diffuse, system.weight, x))
-    others = np.concatenate([system.lobes, system.rotations], axis=2, dtype=np.float64)
+    others = np.moveaxis(system.others, 1, 2).astype(np.float64)
     entry = pixels.entry.reshape(-1, UNDER_PIXEL)
     value = by_diffuse[..., None] * x[:, None, :3]
     value += np.einsum("mu,mjuc->mjc", x[:, 3:], others)

@@ -10,12 +10,12 @@ from reflfield.field.half_vector import (
     DIFFUSE_NODES,
     LOBE_NODES,
     N_DIFFERENCE,
-    evaluate_half_vector,
     half_angles,
 )
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
 from reflfield.fitting.image_fit import _changed, frames_with, image_step, pixel_rows
+from reflfield.fitting.pixel_kernels import HALF_ANGLE
 from reflfield.fitting.pixel_system import (
-    HALF_ANGLE,
     Linearisation,
     ViewPixels,
     linearisation_shapes,
@@ -87,8 +87,7 @@ def test_derivatives_are_those_of_finite_differences(small_rng):
         parts = np.concatenate(
             [
                 system.diffuse[:, :, None, None] * np.eye(3),
-                system.lobes,
-                system.rotations,
+                np.moveaxis(system.others, 1, 2),
             ],
             axis=2,
         )[:, :, unknown]

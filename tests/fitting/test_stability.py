@@ -18,17 +18,22 @@ from reflfield.field.half_vector import (
     LOBE_NODES,
     SKEW_NODES,
     HalfVectorModel,
-    evaluate_half_vector,
-    half_taps,
-    lobe_tap,
 )
+from reflfield.field.half_vector_batches import (
+    empty_batch,
+    lobe_place,
+    place_batch,
+    put_pairs,
+)
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
 from reflfield.fitting.image_fit import (
     LARGEST_TILT,
     LARGEST_TURN,
     _changed,
     image_step,
 )
-from reflfield.fitting.pixel_system import HALF_ANGLE, linearised, normal_product
+from reflfield.fitting.pixel_kernels import HALF_ANGLE
+from reflfield.fitting.pixel_system import linearised, normal_product
 from reflfield.fitting.robust_weights import HUBER, squared_weight
 from reflfield.fitting.tangents import turned_to_long_axes
 from reflfield.fitting.texel_graph import TexelGraph
@@ -72,6 +77,15 @@ def white(n=1):
     )
 
 
+def lobe_corners(model, view, light):
+    """First node of a pair of directions in the lobes, and the weights of eight corners."""
+    batch = empty_batch()
+    put_pairs(0, 1, np.zeros(1, np.int32), model.frames, view[None], light[None], batch)
+    place_batch(batch)
+    node, shares = lobe_place(0, batch)
+    return int(node), [float(share) for share in shares]
+
+
 def sample(model, view, light):
     out = np.zeros((1, 3), np.float32)
     texel = np.zeros(1, np.int32)
@@ -91,10 +105,9 @@ def test_samples_of_any_directions_are_bounded(bounded):
             assert np.isfinite(value).all()
             values.append(value.max())
             lowest.append(value.min())
-            taps = half_taps(model.frames[0], towards, light)[0]
-            weights = [float(lobe_tap(m, taps)[1]) for m in range(8)]
+            node, weights = lobe_corners(model, towards, light)
             assert min(weights) >= 0
-            assert 0 <= taps[0] < LOBE_NODES
+            assert 0 <= node < LOBE_NODES
             sums.append(abs(sum(weights) - 1))
 
     search()
@@ -372,7 +385,7 @@ def test_derivatives_of_pixels_are_those_of_differences(small_rng, bounded):
     model = smooth_model(small_rng)
     view = pixels_of(small_rng, model)
     system = linearised(view, model, zeros(view, model)).system
-    parts = [system.diffuse[:, :, None, None] * np.eye(3), system.lobes, system.rotations]
+    parts = [system.diffuse[:, :, None, None] * np.eye(3), np.moveaxis(system.others, 1, 2)]
     parts, errors = np.concatenate(parts, axis=2), []
     for unknown in range(7):
         step = np.zeros((N_TEXELS, 7))

@@ -12,9 +12,9 @@ from reflfield.field.half_vector import (
     N_DIFFERENCE,
     SKEW_NODES,
     SKEW_RINGS,
-    evaluate_half_vector,
     half_angles,
 )
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
 from reflfield.fitting import table_fit
 from reflfield.fitting.table_fit import (
     FREE_SKEWS,

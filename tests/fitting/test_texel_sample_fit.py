@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reflfield.field.half_vector import evaluate_half_vector, half_angles
+from reflfield.field.half_vector import half_angles
+from reflfield.field.half_vector_evaluation import evaluate_half_vector
 from reflfield.fitting.tangents import with_tangents_along_highlights
 from reflfield.fitting.texel_graph import TexelGraph, texel_graph
 from reflfield.fitting.texel_sample_fit import (
