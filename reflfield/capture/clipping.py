@@ -72,15 +72,20 @@ def kinds_of_stored(
     >>> kinds_of_stored(photograph, integer=True)[0, :, 0].tolist()
     [2, 0, 1]
     """
-    limits = [
-        _upper_limit(stored[..., i], integer) if white_level is None else white_level
-        for i in range(stored.shape[2])
-    ]
-    kinds = np.full(stored.shape, MEASURED, np.uint8)  # a byte each: photographs are large
-    kinds[~(stored < np.array(limits, np.float32))] = SATURATED
+    _, width, n_channels = stored.shape
+    # Whole rows at once: loops over the few channels of each pixel are slow.
+    rows = stored.reshape(len(stored), width * n_channels)
+    if white_level is None:
+        tops = rows.max(axis=0, initial=0.0).reshape(width, n_channels).max(axis=0, initial=0.0)
+        limits = [_upper_limit(stored[..., i], top, integer) for i, top in enumerate(tops)]
+    else:
+        limits = [white_level] * n_channels
+    # A byte each, as photographs are large.
+    saturated = ~(rows < np.tile(np.array(limits, np.float32), width))
+    kinds = np.where(saturated, np.uint8(SATURATED), np.uint8(MEASURED))
     if integer:
-        kinds[stored <= 0] = BLACK
-    return kinds
+        kinds[rows <= 0] = BLACK
+    return kinds.reshape(stored.shape)
 
 
 def kinds_of_bracket(shots: Sequence[Kinds], seconds: Sequence[float]) -> Kinds:
@@ -120,14 +125,13 @@ def with_bounded_black(image: Float32, kinds: Kinds) -> Float32:
     return np.where(black, BLACK_SHARE * darkest, image).astype(np.float32)
 
 
-def _upper_limit(channel: Float32, integer: bool) -> float:
+def _upper_limit(channel: Float32, top: np.float32, integer: bool) -> float:
     """The value at which a channel is saturated; infinity where none is."""
-    top = channel.max(initial=0.0)
     if top <= 0:
         return np.inf
     if integer and top >= 1:
         return float(top)
-    count = int((channel == top).sum())
+    count = int(np.count_nonzero(channel == top))
     enough = count >= max(PLATEAU_PIXELS, PLATEAU_SHARE * channel.size)
     if enough and count < channel.size and (_usual(top, integer) or _pile(channel, top, count)):
         return float(top)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -64,13 +64,13 @@ def patch_costs(images: PackedImages, sweep: Sweep, own: OwnImage, others: Indic
     """Costs (h, w, n_surfaces): mean of the two views that agree best with a patch."""
     shape = own.covered.shape
     costs = np.full((*shape, len(sweep.offsets)), OUTSIDE, np.float32)
-    sums, shown = np.zeros((6, *shape), np.float32), np.zeros(shape, np.float32)
+    shown = np.zeros(shape, np.float32)
     for k in range(len(sweep.offsets)):
         lowest = np.full(shape, UNKNOWN)
         second = lowest.copy()
         for j in others:
             _show(images, j, sweep, k, own.covered, shown)
-            _compare(own, shown, sums, lowest, second)
+            _compare(own, shown, lowest, second)
         within = (sweep.low <= k) & (k <= sweep.high)
         costs[within, k] = 0.5 * (lowest + second)[within]
     return costs
@@ -114,57 +114,90 @@ def _show(
             shown[y, x] = (1 - t) * above + t * below
 
 
+# Sums over a patch: how many pixels are compared; of the own and the other brightness, of their
+# squares and of their product.
+N_SUMS = 6
+# Rows and columns of a patch.
+_ACROSS = 2 * REACH + 1
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _plus(index: int, step: int) -> Any:
+    """Sum of two indices of which the compiler knows that they do not count from the end."""
+    return np.uint64(index) + np.uint64(step)
+
+
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _compare(
-    own: OwnImage, shown: Floats, sums: Floats, lowest: Floats, second: Floats
+def _compare(own: OwnImage, shown: Floats, lowest: Floats, second: Floats) -> None:
+    """Lower the two least costs of each pixel by those of one view.
+
+    Sums are made row by row: over the height of a patch, then over its width. All loops along a
+    row are without branches, for vector instructions.
+    """
+    height, width = shown.shape
+    terms = np.zeros((_ACROSS, N_SUMS, width), np.float32)
+    high = np.zeros((N_SUMS, width + 2 * REACH), np.float32)
+    sums = np.zeros((N_SUMS, width), np.float32)
+    for y in range(min(REACH, height)):
+        _products(own.grey, shown, y, terms, y)
+    for y in range(height):
+        newest = (y + REACH) % _ACROSS
+        if y + REACH < height:
+            _products(own.grey, shown, y + REACH, terms, newest)
+        else:
+            terms[newest] = 0
+        _over_patches(terms, high, sums)
+        _lower(own.covered, y, sums, lowest, second)
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _products(grey: Floats, shown: Floats, y: int, terms: Floats, place: int) -> None:
+    """What each pixel of a row adds to the sums over patches."""
+    for x in range(shown.shape[1]):
+        other = shown[y, x]
+        seen = np.float32(1) if other != NOT_SEEN else np.float32(0)
+        mine, other = seen * grey[y, x], seen * other
+        terms[place, 0, x], terms[place, 1, x], terms[place, 2, x] = seen, mine, other
+        terms[place, 3, x] = mine * mine
+        terms[place, 4, x] = other * other
+        terms[place, 5, x] = mine * other
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _over_patches(terms: Floats, high: Floats, sums: Floats) -> None:
+    """Sums over patches from the terms of their rows; `high` has zeros beside the row."""
+    width = sums.shape[1]
+    for i in range(N_SUMS):
+        for x in range(width):
+            total = terms[0, i, x]
+            for row in range(1, _ACROSS):
+                total += terms[row, i, x]
+            high[i, _plus(x, REACH)] = total
+        for x in range(width):
+            total = high[i, x]
+            for column in range(1, _ACROSS):
+                total += high[i, _plus(x, column)]
+            sums[i, x] = total
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _lower(
+    covered: NDArray[np.bool_], y: int, sums: Floats, lowest: Floats, second: Floats
 ) -> None:
-    """Lower the two least costs of each pixel by those of one view."""
-    height, width = shown.shape
-    _sum_along_rows(own.grey, shown, sums)
-    for y in range(height):
-        for x in range(width):
-            if not own.covered[y, x]:
-                continue
-            n, a, b, aa, bb, ab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(max(y - REACH, 0), min(y + REACH + 1, height)):
-                n += sums[0, i, x]
-                a += sums[1, i, x]
-                b += sums[2, i, x]
-                aa += sums[3, i, x]
-                bb += sums[4, i, x]
-                ab += sums[5, i, x]
-            if n < LEAST_SHARE * (2 * REACH + 1) ** 2:
-                continue
-            noise = NOISE**2
-            mine = max(aa / n - (a / n) ** 2, 0.0) + noise
-            other = max(bb / n - (b / n) ** 2, 0.0) + noise
-            cost = np.float32(1.0 - (ab / n - a * b / n**2) / np.sqrt(mine * other))
-            if cost < lowest[y, x]:
-                second[y, x] = lowest[y, x]
-                lowest[y, x] = cost
-            elif cost < second[y, x]:
-                second[y, x] = cost
-
-
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _sum_along_rows(grey: Floats, shown: Floats, sums: Floats) -> None:
-    """Number, sums, squares and products of what is shown, over the width of a patch."""
-    height, width = shown.shape
-    for y in range(height):
-        for x in range(width):
-            n, a, b, aa, bb, ab = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(max(x - REACH, 0), min(x + REACH + 1, width)):
-                other = shown[y, i]
-                if other != NOT_SEEN:
-                    mine = grey[y, i]
-                    n += 1.0
-                    a += mine
-                    b += other
-                    aa += mine * mine
-                    bb += other * other
-                    ab += mine * other
-            sums[0, y, x], sums[1, y, x], sums[2, y, x] = n, a, b
-            sums[3, y, x], sums[4, y, x], sums[5, y, x] = aa, bb, ab
+    """Lower the two least costs of a row where a patch can be compared."""
+    one, noise = np.float32(1), np.float32(NOISE**2)
+    for x in range(sums.shape[1]):
+        n = sums[0, x]
+        usable = covered[y, x] and n >= np.float32(LEAST_SHARE * _ACROSS**2)
+        per = one / max(n, one)
+        a, b = sums[1, x] * per, sums[2, x] * per
+        mine = max(sums[3, x] * per - a * a, np.float32(0)) + noise
+        other = max(sums[4, x] * per - b * b, np.float32(0)) + noise
+        cost = one - (sums[5, x] * per - a * b) / np.sqrt(mine * other)
+        cost = cost if usable else OUTSIDE
+        least = lowest[y, x]
+        second[y, x] = min(second[y, x], max(cost, least))
+        lowest[y, x] = min(cost, least)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -173,8 +206,9 @@ def aggregated(costs: Floats, low: Indices, high: Indices) -> Floats:
     height, width, n = costs.shape
     total = np.zeros_like(costs)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        before = np.full((width, n), OUTSIDE, np.float32)
-        current = np.full((width, n), OUTSIDE, np.float32)
+        # A surface more at each end, so that all have neighbours.
+        before = np.full((width, n + 2), OUTSIDE, np.float32)
+        current = np.full((width, n + 2), OUTSIDE, np.float32)
         for row in range(height):
             y = row if dy >= 0 else height - 1 - row
             for column in range(width):
@@ -182,39 +216,43 @@ def aggregated(costs: Floats, low: Indices, high: Indices) -> Floats:
                 current[x] = OUTSIDE
                 if high[y, x] < 0:
                     continue
-                last = current if dy == 0 else before
                 begins = not (0 <= x - dx < width and 0 <= y - dy < height)
                 begins = begins or high[y - dy, x - dx] < 0
-                # Negative indices, which count from the end, are of paths that begin.
-                _continue_path(
-                    costs[y, x],
-                    (low[y, x], high[y, x]),
-                    last[x - dx if not begins else x],
-                    begins,
-                    current[x],
-                )
-                for k in range(low[y, x], high[y, x] + 1):
-                    total[y, x, k] += current[x, k]
+                first, end = low[y, x], high[y, x] + 1
+                last = current if dy == 0 else before
+                place = x if begins else x - dx
+                _continue_path(costs, (y, x), (first, end), last, place, begins, current)
+                for k in range(first, end):
+                    total[y, x, _plus(k, 0)] += current[x, _plus(k, 1)]
             if dy != 0:
                 before, current = current, before
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def _continue_path(
-    costs: Floats, ends: tuple[int, int], last: Floats, begins: bool, path: Floats
+    costs: Floats,
+    at: tuple[int, int],
+    ends: tuple[int, int],
+    last: Floats,
+    place: int,
+    begins: bool,
+    path: Floats,
 ) -> None:
-    """Write the least costs of paths that are longer by one pixel."""
-    least = np.float32(0) if begins else last.min()
-    for k in range(ends[0], ends[1] + 1):
-        step = least
-        if not begins:
-            step = min(last[k], least + LARGE_STEP)
-            if k > 0:
-                step = min(step, last[k - 1] + SMALL_STEP)
-            if k + 1 < len(last):
-                step = min(step, last[k + 1] + SMALL_STEP)
-        path[k] = costs[k] + step - least
+    """Write the least costs of paths at a pixel: begun there, or at `place` of `last`."""
+    y, x = at
+    if begins:
+        for k in range(ends[0], ends[1]):
+            path[x, _plus(k, 1)] = costs[y, x, _plus(k, 0)]
+        return
+    least = OUTSIDE
+    for k in range(last.shape[1]):
+        least = min(least, last[place, k])
+    jump = least + LARGE_STEP
+    for k in range(ends[0], ends[1]):
+        aside = min(last[place, _plus(k, 0)], last[place, _plus(k, 2)]) + SMALL_STEP
+        step = min(min(last[place, _plus(k, 1)], aside), jump)
+        path[x, _plus(k, 1)] = costs[y, x, _plus(k, 0)] + (step - least)
 
 
 @numba.njit(cache=True, nogil=True)

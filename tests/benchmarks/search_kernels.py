@@ -96,11 +96,11 @@ def stereo(side, seed):
     own = OwnImage(grey[0] - grey[0].mean(), np.ones((side, side), np.bool_))
     others = np.arange(N_OTHERS)
     # Shown: the point 7, the projection 18, its middle 2, two divisions; shares and their
-    # complements 4, three times 3. Sums along rows: 9 for each pixel across a patch, along
-    # columns 6. Two variances of 4 and two divisions each; the cost 5, three divisions and a
-    # root.
-    across = 2 * REACH + 1
-    shown, cost = 7 + 18 + 2 + 2 * DIVISION + 4 + 9, 2 * 4 + 7 * DIVISION + 5 + ROOT
+    # complements 4, three times 3. Products 5; six sums over the height of a patch, and over
+    # its width. What means are multiplied by 1 and a division, means 2, two variances of 5; the
+    # cost 5, a division and a root; the two least 3.
+    sums = 5 + 2 * 6 * 2 * REACH
+    shown, cost = 7 + 18 + 2 + 2 * DIVISION + 4 + 9, 1 + 2 + 2 * 5 + 5 + 3 + 2 * DIVISION + ROOT
     passes = N_SURFACES * N_OTHERS
     # A pass reads the geometry, the own image, what it covers twice, and the other image; it
     # writes and reads what is shown, six sums and the two least costs.
@@ -108,9 +108,9 @@ def stereo(side, seed):
     read = size(sweep.origins, sweep.rays, sweep.front, own.grey, own.covered, own.covered)
     return Kernel(
         item="pixel, surface and view",
-        precision="float64",
+        precision="float32",
         n_items=passes * side**2,
-        operations=shown + 15 * across + cost,
+        operations=shown + sums + cost,
         bytes_read=passes * (read + 4 * side**2 + written),
         bytes_written=passes * written,
         work=lambda: (patch_costs(images, sweep, own, others),),
