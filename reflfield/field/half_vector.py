@@ -77,15 +77,23 @@ class HalfVectorOptions:
         again on the new surface. Needs steps on the photographs.
     smoothness : float
         Of the lobes, relative to what the samples weigh.
+    photographs : int
+        Of dense domes only some of the lights make the field, spread evenly over their
+        directions, so that about so many photographs do: a texel has some ten numbers and is
+        seen by thousands. Not fewer than 32 lights; 0 takes all photographs.
     """
 
     n_lobes: int | Literal["auto"] = "auto"
     image_steps: int = 2
     surface_from_normals: bool = True
     smoothness: float = 3e-4
+    photographs: int = 6000
 
     def __post_init__(self) -> None:
-        check_ranges(self, {"image_steps": (0, 20), "smoothness": (1e-9, 1e3)})
+        check_ranges(
+            self,
+            {"image_steps": (0, 20), "smoothness": (1e-9, 1e3), "photographs": (0, 1 << 30)},
+        )
         if self.n_lobes != "auto":
             check_ranges(self, {"n_lobes": (1, 4)})
 

@@ -20,7 +20,8 @@ SIGGRAPH 2005.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,9 @@ Array = NDArray[np.float64]
 TIE, ANCHOR_TIE, OUTWARD_TIE, SMOOTHNESS = 0.002, 0.05, 0.1, 0.02
 # Slopes beyond this count in proportion, found in so many rounds.
 HUBER, ROUNDS = 0.1, 4
+# Relative residual to which the equations of each round are solved, and those of the last: the
+# weights of one round need no more than that.
+ROUND_TOLERANCE, LAST_TOLERANCE = 1e-2, 1e-5
 # Cosine between normal and ray, and distance of the outline in pixels, at which an anchor has
 # fallen to 1/e; farther outlines than the last anchor nothing.
 ANCHOR_COSINE, ANCHOR_PIXELS, FARTHEST_PIXELS = 0.05, 0.5, 0.75
@@ -89,23 +93,27 @@ def confidence_of(information: Array) -> Array:
 
 def silhouette_anchors(
     cameras: Sequence[Camera],
-    distances: Iterable[SignedDistance | None],
+    distance_of: Callable[[int], SignedDistance | None],
     positions: Array,
     normals: Array,
+    workers: int = 1,
 ) -> Array:
     """How surely each point of the hull lies on the object, (n,) in 0 to 1.
 
     Parameters
     ----------
     cameras : sequence of Camera
-    distances : iterable of SignedDistance
-        To the outlines, read once; None where a view shows none.
+    distance_of : callable
+        Distance to the outline of a view, asked for once; None where it shows none.
     positions, normals : (n, 3) float64
+    workers : int
+        Threads; the anchors do not depend on their number.
     """
-    anchors = np.zeros(len(positions))
-    for camera, distance in zip(cameras, distances, strict=True):
+
+    def of_view(view: int) -> tuple[NDArray[np.intp], Array]:
+        camera, distance = cameras[view], distance_of(view)
         if distance is None:
-            continue
+            return np.zeros(0, np.intp), np.zeros(0)
         pixels, depth = camera.project(positions)
         usable = np.isfinite(pixels).all(axis=1) & (depth > 0)
         away = np.full(len(positions), np.inf)
@@ -113,8 +121,14 @@ def silhouette_anchors(
         near = np.flatnonzero(away < FARTHEST_PIXELS)
         towards = camera.view_directions(positions[near])
         cosine = np.einsum("nd,nd->n", towards, normals[near])
-        sure = np.exp(-((cosine / ANCHOR_COSINE) ** 2) - (away[near] / ANCHOR_PIXELS) ** 2)
-        anchors[near] = np.maximum(anchors[near], sure)
+        return near, np.exp(
+            -((cosine / ANCHOR_COSINE) ** 2) - (away[near] / ANCHOR_PIXELS) ** 2
+        )
+
+    anchors = np.zeros(len(positions))
+    with ThreadPoolExecutor(max(workers, 1)) as pool:
+        for near, sure in pool.map(of_view, range(len(cameras))):
+            anchors[near] = np.maximum(anchors[near], sure)
     return anchors
 
 
@@ -144,7 +158,7 @@ def integrated_displacements(fitted: FittedNormals, graph: TexelGraph, anchors: 
     bending = graph.laplacian()
     smooth = csr_array(bending @ bending * (SMOOTHNESS / edge**2))
     x = np.zeros(len(fitted.positions))
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         tie = (TIE + ANCHOR_TIE * anchors + OUTWARD_TIE * (x > 0)) / edge**2
         size = np.abs(slopes @ x - target)
         robust = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
@@ -152,7 +166,8 @@ def integrated_displacements(fitted: FittedNormals, graph: TexelGraph, anchors: 
         right = slopes.T @ (robust * target)
         scale = diags_array(1.0 / matrix.diagonal())
         # Ties of some thousandths of what an edge weighs: some hundred steps.
-        x, _ = cg(matrix, right, x0=x, rtol=1e-6, maxiter=1000, M=scale)
+        tolerance = ROUND_TOLERANCE if number < ROUNDS - 1 else LAST_TOLERANCE
+        x, _ = cg(matrix, right, x0=x, rtol=tolerance, maxiter=1000, M=scale)
     return np.asarray(x)
 
 

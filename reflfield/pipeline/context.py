@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 
 from reflfield.capture.capture import DIGEST_PARTS, PLANE, Capture
 from reflfield.errors import InputError
-from reflfield.field.clustered_pca import ONE_VIEW_COUNTS, USUAL_COUNTS
+from reflfield.field.clustered_pca import HALF_VECTOR, ONE_VIEW_COUNTS, USUAL_COUNTS
 from reflfield.observations.texel_reading import grid_sides
 from reflfield.options import HoldOut, Resources
 from reflfield.pipeline.cache import StageFolder
-from reflfield.pipeline.hold_out import Split, split_of
+from reflfield.pipeline.hold_out import Split, split_of, with_fewer_lights
 from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.util.blocks import Blocks, Scheduler
 from reflfield.util.file_digests import FileDigests
@@ -112,6 +112,7 @@ class Context:
 
     def __post_init__(self) -> None:
         split = split_of(self.capture, self.hold_out)
+        split = with_fewer_lights(split, self.capture, self._most_photographs)
         derived = {
             "split": split,
             "training": split.training(self.capture),
@@ -123,6 +124,16 @@ class Context:
         counts = ONE_VIEW_COUNTS if self.photometric else USUAL_COUNTS
         compression = self.options.compression.with_counts(*counts)
         object.__setattr__(self, "options", replace(self.options, compression=compression))
+
+    @property
+    def _most_photographs(self) -> int:
+        """Photographs that make the field at most, about; 0 for all."""
+        asked = self.asked_options
+        model, shadows = asked.compression.model, asked.resampling.visibility
+        may_fit = model == AUTO and not asked.wants_clusters and shadows != "kept"
+        if not self.casts_shadows or not (model == HALF_VECTOR or may_fit):
+            return 0
+        return asked.compression.half_vector.photographs
 
     @property
     def asked_options(self) -> PipelineOptions:

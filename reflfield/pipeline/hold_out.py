@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ Bools = NDArray[np.bool_]
 MOST_COMPARED = 64
 # Steps of this share of the lights leave the most even gaps, however many there are.
 GOLDEN_SHARE = (5**0.5 - 1) / 2
+# Of dense domes at least so many lights make the field, if each has as many photographs.
+LEAST_LIGHTS = 32
 # Which of the photographs that do not make the field it is compared with.
 BOTH, EITHER, CHOSEN, TEST = "both", "either", "photographs", "test"
 
@@ -43,6 +45,8 @@ class Split:
         What the compared ones are: of a held-out view and under a held-out light (where
         views and lights are held out), of either, chosen one by one, or the capture's own
         test split. Empty where nothing is held out.
+    redundant : (k,) int
+        Indices of photographs that are not needed and make nothing.
     """
 
     views: Indices
@@ -53,6 +57,7 @@ class Split:
     compared: Indices
     aside: Indices
     kind: str
+    redundant: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
 
     def training(self, capture: Capture) -> Capture:
         """The capture that the field is made of."""
@@ -114,6 +119,68 @@ def split_of(capture: Capture, hold_out: HoldOut) -> Split:
         np.flatnonzero(removed & ~compared),
         kind if removed.any() else "",
     )
+
+
+def with_fewer_lights(split: Split, capture: Capture, most: int) -> Split:
+    """Split of a dense dome that makes the field under some of its lights.
+
+    Parameters
+    ----------
+    split : Split
+    capture : Capture
+        Its lights have known positions or directions.
+    most : int
+        Photographs that make the field, about; 0 for all. No fewer than `LEAST_LIGHTS` lights
+        are left, and none is left out where each has few photographs.
+
+    Returns
+    -------
+    Split
+        Every view keeps photographs under the same lights.
+    """
+    lights = split.training_lights
+    of_light = np.array([capture.photographs[i].light for i in split.trained], np.intp)
+    each = len(of_light) / max(len(lights), 1)
+    n = max(LEAST_LIGHTS, round(most / max(each, 1.0)))
+    if not most or len(of_light) <= most or each < LEAST_LIGHTS or n >= len(lights):
+        return split
+    centre = object_centre(capture)[None]
+    towards = np.concatenate([capture.lights[i].directions(centre) for i in lights])
+    kept = lights[farthest_first(towards, n)]
+    needed = np.isin(of_light, kept)
+    return replace(
+        split,
+        training_lights=kept,
+        trained=split.trained[needed],
+        redundant=split.trained[~needed],
+    )
+
+
+def farthest_first(directions: NDArray[np.floating], count: int) -> Indices:
+    """Indices (count,), ascending, of directions spread evenly.
+
+    Each is the farthest from those before it.
+
+    Parameters
+    ----------
+    directions : (n, 3) float
+        Unit vectors.
+    count : int
+        At most n.
+
+    Examples
+    --------
+    >>> angle = np.radians([0, 1, 2, 45, 89, 90])
+    >>> farthest_first(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), 3)
+    array([0, 3, 5])
+    """
+    nearest = np.full(len(directions), -np.inf)
+    chosen = [0]
+    while len(chosen) < count:
+        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
+        nearest[chosen[-1]] = np.inf
+        chosen.append(int(np.argmin(nearest)))
+    return np.sort(np.array(chosen[:count], np.intp))
 
 
 def _spread(count: int, among: Indices, what: str) -> Indices:
@@ -290,15 +357,19 @@ def held_out_sentence(split: Split) -> str:
     '1 photograph, spread over views and lights, is compared; 9 of 10 make the field'
     """
     n = len(split.trained)
-    total = n + len(split.compared) + len(split.aside)
+    total = n + len(split.compared) + len(split.aside) + len(split.redundant)
+    field_of = f"{n} of {total} make the field"
+    if len(split.redundant):
+        lights = len(split.training_lights)
+        field_of += f", those under {lights} of the lights: the others are redundant"
     if not split.kind:
-        return f"no photograph is held out; {n} of {total} make the field"
+        return f"no photograph is held out; {field_of}"
     compared = counted(len(split.compared), "photograph")
     are = "is" if len(split.compared) == 1 else "are"
     parts = [f"{compared}{_which(split)} {are} compared"]
     if len(split.aside):
         parts.append(f"{len(split.aside)} others of those are used for neither")
-    return "; ".join([*parts, f"{n} of {total} make the field"])
+    return "; ".join([*parts, field_of])
 
 
 def held_out_counts(split: Split) -> dict[str, Any]:
@@ -308,6 +379,7 @@ def held_out_counts(split: Split) -> dict[str, Any]:
         "photographs_compared": len(split.compared),
         "photographs_used_for_neither": len(split.aside),
         "photographs_of_the_field": len(split.trained),
+        "photographs_redundant": len(split.redundant),
     }
 
 

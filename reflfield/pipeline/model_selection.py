@@ -127,9 +127,9 @@ def may_take_half_vector(context: Context) -> bool:
 
 
 def _supports_half_vector(context: Context, visibility: str) -> bool:
-    asked = context.asked_options
-    wants_clusters = asked.comparison.without_alignment or asked.compression.fit != AUTO
-    if visibility == "kept" or not context.casts_shadows or wants_clusters:
+    if visibility == "kept" or not context.casts_shadows:
+        return False
+    if context.asked_options.wants_clusters:
         return False
     n = _samples_with(context, visibility)
     return n >= least_samples(context)

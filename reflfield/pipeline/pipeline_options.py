@@ -199,6 +199,11 @@ class PipelineOptions:
         return not self.aligns and self.compression.half_vector.moves_surface
 
     @property
+    def wants_clusters(self) -> bool:
+        """Whether something is asked for that only clustered fields have."""
+        return self.comparison.without_alignment or self.compression.fit != "auto"
+
+    @property
     def compares_without_alignment(self) -> bool:
         """Whether a second field, in the base frames, is made to compare with."""
         return self.comparison.without_alignment and self.alignment.enabled

@@ -44,6 +44,7 @@ def _photographs(context: Context, projected: dict[str, Any]) -> CountedItems:
             "projected onto the surface": projected["photographs"],
             "held out and compared": len(context.held_out.photographs),
             "of a held-out view or light, used for neither": len(context.split.aside),
+            "redundant, under lights that are not needed": len(context.split.redundant),
         },
     )
 

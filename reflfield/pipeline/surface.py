@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from threading import BoundedSemaphore
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from reflfield.pipeline.half_vector_fit import (
     write_model,
 )
 from reflfield.pipeline.indirect import write_indirect
+from reflfield.pipeline.memory import readers_at_once
 from reflfield.pipeline.observations import lost_observations, write_observations
 from reflfield.pipeline.visibility import write_visibility
 
@@ -46,9 +48,18 @@ def write_surface(context: Context, folder: Path) -> dict[str, Any]:
         normals=normals,
         confidence=confidence_of(fitted_to_images.information),
     )
-    # One at a time: of large photographs all would not fit in memory.
-    distances = (_distance(silhouette) for silhouette in results.silhouettes(context))
-    anchors = silhouette_anchors(context.training.cameras, distances, texels.position, normals)
+    silhouettes = results.silhouettes(context)
+    # As many at a time as the ceiling of memory allows: those of all views may not fit.
+    readers = BoundedSemaphore(readers_at_once(context))
+
+    def distance_of(view: int) -> SignedDistance | None:
+        with readers:
+            return _distance(silhouettes[view])
+
+    anchors = silhouette_anchors(
+        *(context.training.cameras, distance_of, texels.position, normals),
+        workers=context.resources.workers,
+    )
     height = integrated_displacements(fitted, fit.graph, anchors)
     atlas = moved_atlas(results.atlas(context), texels.position, height[:, None] * fitted.base)
     write_atlas_arrays(folder / "atlas.npz", atlas)

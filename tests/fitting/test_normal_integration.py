@@ -110,7 +110,7 @@ def test_anchors_stand_where_an_outline_touches_a_rim():
     points = np.concatenate([pixel - 10.0, [[1.0], [1], [1]]], axis=1)
     normals = np.array([[1.0, 0, 0], [0, 0, -1], [1, 0, 0]])
     distances = [signed_distance(coverage), None]
-    anchors = silhouette_anchors([camera, camera], distances, points, normals)
+    anchors = silhouette_anchors([camera, camera], distances.__getitem__, points, normals)
     assert anchors[0] > 0.9
     assert anchors[1] < 1e-100  # exp(-(1 / .05)^2), of a cosine of 1
     assert anchors[2] == 0

@@ -13,10 +13,12 @@ from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError
 from reflfield.options import HoldOut, parse_hold_out
 from reflfield.pipeline.hold_out import (
+    farthest_first,
     held_out_sentence,
     left_out_sentences,
     split_of,
     spread_photographs,
+    with_fewer_lights,
 )
 
 
@@ -266,3 +268,54 @@ class TestLightCone:
         lights = (*fan.lights[:7], Light("sky", "unknown"))
         with pytest.raises(InputError, match=r"light-cone: .*'sky'"):
             split_of(replace(fan, lights=lights), HoldOut(light_cone=25.0))
+
+
+class TestDenseDomes:
+    """A dome of 40 views and 90 lights, of which a part is enough."""
+
+    @pytest.fixture
+    def dome(self, rng):
+        capture = dense(40, 90)
+        towards = rng.normal(size=(90, 3)) + np.array([0.0, 0.0, 1.0])
+        lights = tuple(
+            Light(f"l{j}", "directional", direction=d) for j, d in enumerate(towards)
+        )
+        return replace(capture, lights=lights)
+
+    @pytest.mark.parametrize(("most", "left"), [(2000, 53), (100, 32)])
+    def test_every_view_keeps_the_same_lights(self, dome, most, left):
+        whole = split_of(dome, HoldOut(views=2, lights=2))
+        split = with_fewer_lights(whole, dome, most)
+        assert len(split.training_lights) == left
+        assert len(split.trained) == 38 * left
+        assert np.unique(pairs_of(dome, split.trained), axis=0).shape == (38 * left, 2)
+        both = np.concatenate([split.trained, split.redundant])
+        np.testing.assert_array_equal(np.sort(both), whole.trained)
+        np.testing.assert_array_equal(split.compared, whole.compared)
+        training = split.training(dome)
+        assert (training.n_views, training.n_lights) == (38, left)
+        assert f"{38 * left} of 3600 make the field, those under {left} of the lights" in (
+            held_out_sentence(split)
+        )
+
+    @pytest.mark.parametrize(
+        ("capture", "most"),
+        [
+            pytest.param(dense(20, 20), 100, id="few lights"),
+            pytest.param(dense(40, 90), 3600, id="few photographs"),
+            pytest.param(dense(40, 90), 0, id="all asked for"),
+            pytest.param(flash(200), 100, id="a light for each photograph"),
+        ],
+    )
+    def test_nothing_is_left_out_of_others(self, capture, most):
+        whole = split_of(capture, HoldOut())
+        assert with_fewer_lights(whole, capture, most) is whole
+
+    def test_lights_are_spread_over_their_directions(self, rng):
+        # Nine of ten within ten degrees, the others far apart.
+        near, far = np.array([0.0, 0, 1]) + 0.05 * rng.normal(size=(90, 3)), np.eye(3)
+        directions = np.concatenate([near, far, -far])
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        chosen = farthest_first(directions, 7)
+        assert set(range(90, 96)) - {92} <= set(chosen.tolist())
+        assert farthest_first(directions, 96).tolist() == list(range(96))
