@@ -32,6 +32,8 @@ INDIRECT_ARRAYS: Schema = {
     "indirect_functions": (("float32",), ("n_indirect_functions", "n_harmonics", 3)),
     "indirect_coefficients": (_CODES, ("n_texels", "n_indirect_components")),
     "indirect_scale": (("float32",), (1,)),
+    # Not in files before version 6, whose fields trace no bounced light.
+    "bounce_gain": (("float32",), (3,)),
 }
 # Of a field of clusters with mean and basis on the nodes of two grids.
 ARRAYS: Schema = {

@@ -283,6 +283,7 @@ def _check_reflectance(reflectance: FittedReflectance) -> None:
     if reflectance.indirect is not None:
         check_shape("indirect", reflectance.indirect.coefficients, (len(cluster), None))
         check_finite("indirect", reflectance.indirect.functions)
+        check_finite("indirect", reflectance.indirect.gain)
         check_finite("indirect", reflectance.indirect.coefficients)
 
 
@@ -320,6 +321,7 @@ def indirect_arrays(
         "indirect_functions": np.ascontiguousarray(light.functions, np.float32),
         "indirect_coefficients": smallest_codes(codes.astype(np.int32)),
         "indirect_scale": np.array([step], np.float32),
+        "bounce_gain": np.asarray(light.gain, np.float32),
     }
 
 

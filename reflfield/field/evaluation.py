@@ -306,6 +306,7 @@ def sum_lights(
     lights_world: ArrayLike,
     irradiances: ArrayLike,
     lit: NDArray[np.bool_] | None = None,
+    indirect: bool = True,
 ) -> NDArray[np.float32]:
     """Radiance of texels under many distant lights that all texels share.
 
@@ -324,7 +325,9 @@ def sum_lights(
         its radiance times its solid angle.
     lit : (n, m) bool, optional
         True where light j reaches texel i; all by default. Where it does not, the texel shows
-        its indirect light.
+        its indirect light, without bounced light.
+    indirect : bool
+        Whether it does.
 
     Returns
     -------
@@ -358,10 +361,10 @@ def sum_lights(
         check_shape("lit", reached, (len(index), len(lights)))
     out = np.zeros((len(index), 3), np.float32)
     _add_direct_light(field, index, views, (lights, powers, reached), out)
-    if lit is not None and not field.indirect.is_black:
-        indirect = field.indirect.under(index, lights, field.inverse_power)
+    if indirect and lit is not None and not field.indirect.is_black:
+        shown = field.indirect.under(index, lights, field.inverse_power)
         dark = ~reached & (index >= 0)[:, None]
-        out += np.einsum("nmc,mc,nm->nc", indirect, powers, dark, optimize=True)
+        out += np.einsum("nmc,mc,nm->nc", shown, powers, dark, optimize=True)
     return out
 
 

@@ -1,10 +1,11 @@
-"""The file of a reflectance field, `field.rfld`, version 5.
+"""The file of a reflectance field, `field.rfld`, version 6.
 
 A ZIP archive of `header.json` and one member for each array of the model's schema
 (`field.reflectance_field.SCHEMAS`), packed as `array_coding` describes. The header names
 format, version and model and, for each array, its dtype, shape, filter, context bits and the
-SHA-256 of its member. Version 4, which is read too, knows no skews of lobes, and version 3 only
-clustered fields, and names no model. Time stamps are fixed, so equal fields give equal bytes.
+SHA-256 of its member. Earlier versions are read too: 5 knows no bounced light, 4 no skews of
+lobes, 3 only clustered fields, and names no model. Time stamps are fixed, so equal fields give
+equal bytes.
 
 Opening reads the header alone; an array is read, and its checksum compared,
 when it is first used. Nothing is unpickled, nothing is extracted to disk, and
@@ -49,10 +50,11 @@ from reflfield.field.stored_values import (
 from reflfield.util.files import check_regular, replacing
 
 FORMAT_NAME = "reflfield-field"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 OLDEST_VERSION = 3
 
 SKEWS, FIRST_WITH_SKEWS = "lobe_skews", 5
+BOUNCE, FIRST_WITH_BOUNCE = "bounce_gain", 6
 
 HEADER = "header.json"
 MAX_HEADER_BYTES = 16 << 20
@@ -170,7 +172,7 @@ def open_field(path: Path | str, *, max_bytes: int = MAX_BYTES) -> ReflectanceFi
             "be trusted"
         )
     with _naming(path):
-        return _field(header, StoredArrays(path, declared, _without_skews(header, shapes)))
+        return _field(header, StoredArrays(path, declared, _not_stored(header, shapes)))
 
 
 @dataclass(frozen=True)
@@ -386,7 +388,7 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
         }
         types = {n: (a.dtype, a.shape) for n, a in declared.items()}
         shapes = {n: shape for n, (_, shape) in types.items()}
-        absent = {n: (a.dtype.name, a.shape) for n, a in _without_skews(header, shapes).items()}
+        absent = {n: (a.dtype.name, a.shape) for n, a in _not_stored(header, shapes).items()}
         check_lengths(check_arrays(types | absent, header["model"]), SCHEMAS[header["model"]])
         for name, array in declared.items():
             if array.filter not in FILTERS:
@@ -397,19 +399,22 @@ def _declared(path: Path, header: Mapping[str, Any]) -> dict[str, DeclaredArray]
 
 def _stored_schema(header: Mapping[str, Any]) -> list[str]:
     """Arrays that a file of this version holds."""
-    absent = () if header["version"] >= FIRST_WITH_SKEWS else (SKEWS,)
-    return [name for name in SCHEMAS[header["model"]] if name not in absent]
+    first = {SKEWS: FIRST_WITH_SKEWS, BOUNCE: FIRST_WITH_BOUNCE}
+    return [n for n in SCHEMAS[header["model"]] if header["version"] >= first.get(n, 0)]
 
 
-def _without_skews(
+def _not_stored(
     header: Mapping[str, Any], shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, NDArray[Any]]:
-    """What a file of an earlier version lacks: skews, which are zero, by name."""
-    if SKEWS in _stored_schema(header) or SKEWS not in SCHEMAS[header["model"]]:
-        return {}
+    """What a file of an earlier version lacks, by name: skews and bounced light, all zero."""
     n_lobes = min(shapes.get("lobe_scale", (1,))[:1] or (1,))
     skews = np.zeros((1, SKEW_NODES, 3), np.int8)
-    return {SKEWS: np.broadcast_to(skews, (n_lobes, *skews.shape[1:]))}
+    zeros: dict[str, NDArray[Any]] = {
+        SKEWS: np.broadcast_to(skews, (n_lobes, *skews.shape[1:])),
+        BOUNCE: np.zeros(3, np.float32),
+    }
+    lacking = set(SCHEMAS[header["model"]]) - set(_stored_schema(header))
+    return {name: zeros[name] for name in lacking}
 
 
 def _length(value: Any) -> int:

@@ -8,13 +8,22 @@ them. For texel t and light l in whose shadow it lies, a field shows, in the tra
 Y the real spherical harmonics of the light's direction in the world, m and B coefficients of
 each channel. `field.indirect_fit` finds them.
 
+Part of that light is known without a fit: what lit parts of the surface send to the texel,
+traced through the field itself (`render.bounced_light`). Where the capture shows it, harmonics
+hold what it leaves, and
+
+.. math:: u_{tl} = g\, T(b_{tl}) + Y(l)^\top \Big( m + \sum_k c_{tk} B_k \Big),
+
+b the bounced light of texel t under light l as a sample, T the transform of the domain and g a
+gain of each channel, 0 where the capture shows no such light.
+
 Nothing is extrapolated: towards lights from where none of the capture's came, a texel shows
 what it would under the nearest of those (`field.observed_sphere`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import isqrt
 from typing import Any
@@ -44,22 +53,31 @@ class IndirectLight:
     observed : (n, 3) float64, optional
         Directions of the lights that the functions are known for; beyond them the nearest
         ones count. By default the functions are taken as they are everywhere.
+    gain : (3,) float32, optional
+        Of bounced light, in the transformed domain. By default none is traced.
     """
 
     functions: Floats
     coefficients: Floats
     observed: Array | None = None
+    gain: Floats = field(default_factory=lambda: np.zeros(3, np.float32))
 
     def __post_init__(self) -> None:
         check_shape("functions", self.functions, (None, None, 3))
         check_shape("coefficients", self.coefficients, (None, len(self.functions) - 1))
+        check_shape("gain", self.gain, (3,))
         if self.observed is not None:
             check_shape("observed", self.observed, (None, 3))
 
     @property
     def is_black(self) -> bool:
         """Whether there is none anywhere."""
-        return not np.any(self.functions)
+        return not (np.any(self.functions) or self.is_traced)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether bounced light is a part of it."""
+        return bool(np.any(self.gain))
 
     @property
     def band_limit(self) -> int:
@@ -99,7 +117,11 @@ class IndirectLight:
         return values.reshape(len(directions), len(self.functions), 3)
 
     def towards(
-        self, texels: NDArray[np.integer], directions: NDArray[Any], power: int
+        self,
+        texels: NDArray[np.integer],
+        directions: NDArray[Any],
+        power: int,
+        bounced: Floats | None = None,
     ) -> Floats:
         """Indirect light of texels, each under a light of its own.
 
@@ -110,6 +132,8 @@ class IndirectLight:
             Unit vectors to the light, world frame.
         power : int
             Of the inverse transform, from the domain to samples.
+        bounced : (n, 3) float32, optional
+            Bounced light as samples, not negative; none by default.
 
         Returns
         -------
@@ -117,15 +141,25 @@ class IndirectLight:
             1/sr, never negative.
         """
         values = np.einsum("nk,nkc->nc", self._weights(texels), self.at(directions))
-        return np.maximum(values, 0) ** power
+        return self._samples(values, power, bounced)
 
     def under(
-        self, texels: NDArray[np.integer], directions: NDArray[Any], power: int
+        self,
+        texels: NDArray[np.integer],
+        directions: NDArray[Any],
+        power: int,
+        bounced: Floats | None = None,
     ) -> Floats:
         """Indirect light of texels under lights that all share, (n, m, 3); see `towards`."""
         at_lights = np.moveaxis(self.at(directions), 1, 0).reshape(len(self.functions), -1)
         values = self._weights(texels) @ at_lights
-        return np.maximum(values.reshape(len(texels), len(directions), 3), 0) ** power
+        return self._samples(values.reshape(len(texels), len(directions), 3), power, bounced)
+
+    def _samples(self, values: Floats, power: int, bounced: Floats | None) -> Floats:
+        """Samples from what harmonics show and bounced light."""
+        if bounced is not None:
+            values = values + self.gain * bounced ** np.float32(1 / power)
+        return np.asarray(np.maximum(values, 0) ** power)
 
 
 def no_indirect_light(n_texels: int) -> IndirectLight:

@@ -121,7 +121,7 @@ def bounded_table(values_at: Callable[[Array], Floats], observed: ArrayLike) -> 
     lights = np.asarray(observed, np.float64)
     nodes = table_directions().reshape(-1, 3)
     inside = covered(nodes, lights)
-    samples = _fibonacci(N_SAMPLES)
+    samples = fibonacci_directions(N_SAMPLES)
     sources = np.concatenate([lights, samples[covered(samples, lights)]])
     at_sources = np.asarray(values_at(sources), np.float64)
     table = np.asarray(values_at(nodes), np.float32)
@@ -204,7 +204,7 @@ def _disk(observed: Array) -> NDArray[np.intp]:
     return np.stack([np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], axis=1)
 
 
-def _fibonacci(n: int) -> Array:
+def fibonacci_directions(n: int) -> Array:
     """Directions spread evenly over the sphere, (n, 3)."""
     z = 1.0 - (2.0 * np.arange(n) + 1.0) / n
     phi = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(n)

@@ -64,6 +64,8 @@ LIGHT_MODELS = ("known", "unknown")
 # Largest sample that a field may show, 1/sr, by the sum of its terms; sums of samples under
 # lights of any ordinary unit stay finite as singles.
 LARGEST_SAMPLE = 1e33
+# Largest gain of bounced light; those that are fitted are about 1, or 0.
+LARGEST_GAIN = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +160,10 @@ class ReflectanceField(ABC):
         functions, scale = (self.arrays[f"indirect_{n}"] for n in ("functions", "scale"))
         codes = self.arrays["indirect_coefficients"].astype(np.float32)
         self._check_samples("indirect_functions", functions, 0, codes * scale)
-        return IndirectLight(functions, codes * scale, self.observed_lights)
+        gain = self.arrays["bounce_gain"]
+        check_finite("bounce_gain", gain)
+        self._check_bound("bounce_gain", float(np.abs(gain).max()), LARGEST_GAIN)
+        return IndirectLight(functions, codes * scale, self.observed_lights, gain)
 
     def _check_samples(
         self, name: str, functions: NDArray[Any], axis: int, weights: NDArray[Any]

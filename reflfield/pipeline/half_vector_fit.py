@@ -21,6 +21,7 @@ from reflfield.field.build import Quantisation
 from reflfield.field.file import write_field
 from reflfield.field.half_vector import HalfVectorModel, HalfVectorOptions
 from reflfield.field.half_vector_build import build_half_vector_field
+from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.reflectance_field import HalfVectorField
 from reflfield.field.step_search import field_as_asked
 from reflfield.fitting.image_fit import ImageFit, frames_with, image_step, pixel_rows
@@ -55,6 +56,7 @@ from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.light_agreement import beside_the_view
 from reflfield.pipeline import results
+from reflfield.pipeline.bounce_fit import with_bounced_light
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import readers_at_once, working_bytes
@@ -280,13 +282,15 @@ class HalfVectorFit:
             return lambda shape: np.zeros(shape, np.float32)
         return partial(array_in_file, folder)
 
-    def build(self, model: HalfVectorModel, step: float) -> HalfVectorField:
+    def build(
+        self, model: HalfVectorModel, step: float, indirect: IndirectLight | None = None
+    ) -> HalfVectorField:
         """Quantise a model in units of white on the base surface into a field."""
         context = self.context
         return build_half_vector_field(
             results.base_surface(context),
             in_samples(model, self.white),
-            results.indirect_light(context),
+            indirect,
             domain=context.options.resampling.domain,  # type: ignore[arg-type]
             visibility=context.visibility_kind,  # type: ignore[arg-type]
             metadata=field_metadata(context, plain(context.options)),
@@ -297,9 +301,11 @@ class HalfVectorFit:
         """Field of the size, the quality or the relative step that was asked for."""
         options = self.context.options.compression
         step = self.step(options.step)
+        harmonics = results.indirect_light(self.context)
+        indirect = with_bounced_light(self.context, self.build(model, 0.0), harmonics)
 
         def build(at: float) -> HalfVectorField:
-            return self.build(model, at)
+            return self.build(model, at, indirect)
 
         return field_as_asked(build, self.quality, step, size=options.size, least=options.psnr)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from reflfield.field.indirect_fit import fit_indirect
+from reflfield.field.indirect_fit import IndirectModel, fit_indirect
+from reflfield.observations.stored_shade import StoredShade
 from reflfield.observations.texel_reading import Shade, TexelReader
 from reflfield.pipeline import results
 from reflfield.pipeline.atlas import pixel_width
@@ -30,7 +30,7 @@ GOLDEN_SHARE = (5**0.5 - 1) / 2
 
 def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
     """Write the indirect light of all texels that a camera sees."""
-    options, reader = context.options.indirect, results.base_reader(context)
+    reader = results.base_reader(context)
     in_view = results.texels_in_view(context)
     parts = context.blocks(folder).map(
         "light in the shadows",
@@ -38,25 +38,29 @@ def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
         (reader, texels_at_edge(context)),
         reader.blocks_of(in_view),
     )
-    shade = Shade(*(parts.joined(name) for name in ("values", "weights", "lights")))
     n_samples, n_used = (
         sum(float(part[name]) for part in parts) for name in ("samples", "used")
     )
-    in_shade = np.flatnonzero(shade.weights.any(axis=(1, 2)))
-    rng = np.random.default_rng(context.options.seed)
-    n = min(len(in_shade), options.training_texels)
-    training = np.sort(rng.choice(in_shade, n, replace=False))
-    read = partial(shade_rows, shade, reader.domain_unit)
-    model = fit_indirect(read, training, context.training.n_lights, options.n_components)
-    coefficients = np.zeros((reader.n_texels, len(model.variances)), np.float32)
-    # Of the others nothing but the mean is known.
-    for rows in np.array_split(in_shade, max(1, len(in_shade) // 1024)):
-        coefficients[in_view[rows]] = model.coefficients(read(rows))
+    kept = {name: parts.joined(name) for name in ("values", "weights", "light")}
+    shade = StoredShade(
+        in_view,
+        **kept,
+        unit=reader.domain_unit,
+        capture=context.training,
+        positions=results.texels(context).position,
+    )
+    shade = shade.only(np.flatnonzero(shade.weights.any(axis=(1, 2))))
+    model, coefficients = fitted_to_shade(context, shade, shade.rows)
     np.savez(folder / "indirect.npz", functions=model.functions(), coefficients=coefficients)
+    np.savez(
+        folder / results.SHADE,
+        **{name: getattr(shade, name) for name in ("texels", *kept)},
+        unit=np.array(shade.unit),
+    )
     return {
         "samples in shadow": int(n_samples),
         "samples at edges of shadows": int(n_samples - n_used),
-        "texels that show shadow": len(in_shade),
+        "texels that show shadow": len(shade.texels),
         "components": len(model.variances),
         "residual of the transformed samples": float(np.sqrt(model.noise)),
     }
@@ -70,11 +74,29 @@ def texels_at_edge(context: Context) -> NDArray[np.bool_]:
     return neighbourhood_reached(texels.position, results.light_visible(context), radius)
 
 
-def shade_rows(shade: Shade, unit: float, rows: NDArray[np.intp]) -> Shade:
-    """Return some rows of a shade whose values are halves in a unit."""
-    values = shade.values[rows].astype(np.float32) * np.float32(unit)
-    weights = shade.weights[rows].astype(np.float32)
-    return replace(shade, values=values, weights=weights, lights=shade.lights[rows])
+def fitted_to_shade(
+    context: Context, shade: StoredShade, read: Callable[[NDArray[np.intp]], Shade]
+) -> tuple[IndirectModel, NDArray[np.float32]]:
+    """Model of indirect light, and coefficients (n_texels, K) of all texels.
+
+    Parameters
+    ----------
+    context : Context
+    shade : StoredShade
+        Of the texels that have any.
+    read : callable
+        Shade of some rows of that.
+    """
+    options, n_in_shade = context.options.indirect, len(shade.texels)
+    rng = np.random.default_rng(context.options.seed)
+    n = min(n_in_shade, options.training_texels)
+    training = np.sort(rng.choice(n_in_shade, n, replace=False))
+    model = fit_indirect(read, training, context.training.n_lights, options.n_components)
+    coefficients = np.zeros((len(shade.positions), len(model.variances)), np.float32)
+    # Of the others nothing but the mean is known.
+    for rows in np.array_split(np.arange(n_in_shade), max(1, n_in_shade // 1024)):
+        coefficients[shade.texels[rows]] = model.coefficients(read(rows))
+    return model, coefficients
 
 
 def shade_block(
@@ -100,7 +122,7 @@ def shade_block(
     return {
         "values": (shade.values[kept] / np.float32(reader.domain_unit)).astype(np.float16),
         "weights": used[kept],
-        "lights": shade.lights[kept],
+        "light": kept[1].astype(np.int32),
         "samples": np.array(n_views.sum(dtype=np.float64)),
         "used": np.array((n_views * inside).sum(dtype=np.float64)),
     }

@@ -25,7 +25,8 @@ def write_left_out_views(context: Context, folder: Path) -> dict[str, Any]:
     options = context.options
     if options.resampling.visibility == AUTO:
         resampling = replace(options.resampling, visibility="factored")
-        context = replace(context, options=replace(options, resampling=resampling))
+        options = replace(options, resampling=resampling)
+        context = replace(context, options=options, asked=context.asked_options)
     measured = HalfVectorFit(context).left_out_errors()
     np.savez(folder / LEFT_OUT_ERRORS, **measured)  # type: ignore[arg-type]
     return {

@@ -161,8 +161,9 @@ def least_samples(context: Context) -> int:
 
 def _with_visibility(context: Context, visibility: str) -> Context:
     """The context with shadows treated in a way, as far as its samples are concerned."""
-    options = Candidate(visibility, AUTO).applied_to(context.asked_options)
-    return replace(context, options=options)
+    asked = context.asked_options
+    options = Candidate(visibility, AUTO).applied_to(asked)
+    return replace(context, options=options, asked=asked)
 
 
 def _samples_with(context: Context, visibility: str) -> float:

@@ -136,11 +136,15 @@ class IndirectOptions:
         False leaves traced shadows black.
     training_texels : int
         Texels, drawn at random, that shape the functions; all get coefficients.
+    bounce : bool
+        Trace what lit parts of the surface send into its shadows, where the photographs show
+        such light; the functions hold what it leaves.
     """
 
     n_components: int = 8
     enabled: bool = True
     training_texels: int = 4096
+    bounce: bool = True
 
     def __post_init__(self) -> None:
         check_ranges(self, {"n_components": (0, 1024), "training_texels": (1, 1 << 24)})

@@ -18,6 +18,7 @@ from reflfield.field.build import (
 from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.clustered_pca import CompressionOptions
 from reflfield.field.file import PackedSizes
+from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.observed_sphere import distinct_directions
 from reflfield.field.reflectance_field import ClusteredField
 from reflfield.field.step_search import field_as_asked
@@ -25,6 +26,7 @@ from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.image_projection import directions_of
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline import results
+from reflfield.pipeline.bounce_fit import with_bounced_light
 from reflfield.pipeline.cache import versions
 from reflfield.pipeline.context import Context
 from reflfield.util.progress import track
@@ -69,7 +71,9 @@ class FieldMaker:
         asked = self.context.options.compression
         return self.options is asked and (asked.size > 0 or asked.psnr > 0)
 
-    def fitted(self, model: ClusteredModel, frames: Floats) -> FittedReflectance:
+    def fitted(
+        self, model: ClusteredModel, frames: Floats, indirect: IndirectLight | None = None
+    ) -> FittedReflectance:
         """Model and frames as a field takes them."""
         return FittedReflectance(
             local_from_world=frames,
@@ -78,15 +82,21 @@ class FieldMaker:
             mean=model.mean,
             basis=model.basis,
             domain=self.context.options.resampling.domain,  # type: ignore[arg-type]
-            indirect=results.indirect_light(self.context),
+            indirect=indirect,
         )
 
-    def build(self, model: ClusteredModel, frames: Floats, step: float) -> ClusteredField:
+    def build(
+        self,
+        model: ClusteredModel,
+        frames: Floats,
+        step: float,
+        indirect: IndirectLight | None = None,
+    ) -> ClusteredField:
         """Quantise the model on the base surface into a field."""
         context = self.context
         return build_field(
             results.base_surface(context),
-            self.fitted(model, frames),
+            self.fitted(model, frames, indirect),
             visibility=context.visibility_kind,  # type: ignore[arg-type]
             light_model="known" if context.training.lights_known else "unknown",
             metadata=field_metadata(context, self.made_with),
@@ -97,9 +107,12 @@ class FieldMaker:
         """Field of the size, the quality or the relative step that was asked for."""
         options = self.options
         step = options.step * model.residuals[-1]
+        harmonics = results.indirect_light(self.context)
+        plain = self.build(model, frames, step)
+        indirect = with_bounced_light(self.context, plain, harmonics)
 
         def build(at: float) -> ClusteredField:
-            return self.build(model, frames, at)
+            return self.build(model, frames, at, indirect)
 
         return field_as_asked(build, self.quality, step, size=options.size, least=options.psnr)
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from reflfield.field.file import PackedSizes
+from reflfield.field.file import PackedSizes, open_field
 from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
 from reflfield.metrics.held_out_photographs import compare_with_photographs
 from reflfield.metrics.image_metrics import NothingToMeasure
+from reflfield.pipeline import results
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.comparison import MAIN, variants
 from reflfield.pipeline.compression import stored_model
@@ -41,9 +42,10 @@ def write_rate_distortion(context: Context, folder: Path) -> dict[str, Any]:
 
 def _half_vector_points(context: Context) -> list[RatePoint]:
     fit, model = HalfVectorFit(context.refined), stored_half_vector(context)
+    indirect = open_field(results.field_file(context)).indirect
     sizes, points = PackedSizes(), []
     for relative_step in track(RELATIVE_STEPS, len(RELATIVE_STEPS), "quality against size"):
-        field = fit.build(model, fit.step(relative_step))
+        field = fit.build(model, fit.step(relative_step), indirect)
         size = sizes.of(field)
         points.append(_point(context, fit.quality(field), field, HALF_VECTOR, size))
     return points
@@ -55,11 +57,13 @@ def _clustered_points(context: Context) -> list[RatePoint]:
     sizes, points = PackedSizes(), []
     for variant, stage, relative_step in track(todo, len(todo), "quality against size"):
         model, frames = stored_model(context, stage)
-        field = maker.build(model, frames, relative_step * model.residuals[-1])
+        indirect = open_field(results.field_file(context, stage)).indirect
+        field = maker.build(model, frames, relative_step * model.residuals[-1], indirect)
         quality = maker.quality(field)
         points.append(_point(context, quality, field, CURVES[variant], sizes.of(field)))
     model, frames = stored_model(context, "compression")
-    exact = maker.build(model, frames, 0.0)
+    indirect = open_field(results.field_file(context)).indirect
+    exact = maker.build(model, frames, 0.0, indirect)
     size = unfactored_bytes(exact, sizes)
     return [*points, _point(context, maker.quality(exact), exact, PAPER, size)]
 

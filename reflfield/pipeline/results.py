@@ -18,6 +18,7 @@ from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.geometry.uv_atlas import Atlas
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import Location, ObservationStore, Observed
+from reflfield.observations.stored_shade import StoredShade
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline.cache import RESTARTABLE
 from reflfield.pipeline.clipped_values import MEASURED, stored_measured
@@ -31,6 +32,7 @@ Indices = NDArray[np.intp]
 
 # What the stage "left_out_views" writes.
 LEFT_OUT_ERRORS = "errors.npz"
+SHADE = "shade.npz"
 # In the folder of the observations: the samples, or the name of the place where they are.
 SAMPLES, ELSEWHERE = RESTARTABLE[0], "samples.location"
 
@@ -215,3 +217,12 @@ def indirect_light(context: Context) -> IndirectLight | None:
         return None
     stored = arrays(context, "indirect", "indirect.npz")
     return IndirectLight(stored["functions"], stored["coefficients"])
+
+
+def shade(context: Context) -> StoredShade:
+    """What texels show in traced shadows, where they do."""
+    stored: dict[str, Any] = arrays(context, "indirect", SHADE)
+    unit = float(stored.pop("unit"))
+    return StoredShade(
+        **stored, unit=unit, capture=context.training, positions=texels(context).position
+    )

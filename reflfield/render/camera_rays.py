@@ -94,6 +94,11 @@ class FieldSurface:
     ray_offset : float
         Height at which shadow rays start above the surface, in diagonals of the
         mesh; by default as in the visibility that the field was made with.
+
+    Attributes
+    ----------
+    lift : float
+        That height, metres.
     """
 
     def __init__(
@@ -103,7 +108,7 @@ class FieldSurface:
         self.mesh = Mesh(field.positions, field.faces)
         self.scene = RayScene(self.mesh, threads)
         share = VisibilityOptions().ray_offset if ray_offset is None else ray_offset
-        self._lift = share * self.scene.diagonal
+        self.lift = share * self.scene.diagonal
 
     def first_hits(self, origins: Array, directions: Array) -> SurfaceHits:
         """Meet the surface.
@@ -220,7 +225,7 @@ class FieldSurface:
         """
         reached = np.einsum("nd,nd->n", face_normals, directions) > 0
         rows = np.flatnonzero(reached)
-        starts = positions[rows] + self._lift * face_normals[rows]
+        starts = positions[rows] + self.lift * face_normals[rows]
         limits = None if distances is None else distances[rows]
         reached[rows] = ~self.scene.occluded(starts, directions[rows], limits)
         return reached

@@ -6,7 +6,7 @@ those texels towards camera and light. Lights near enough to be points, far ones
 and spots are evaluated exactly; environment maps as a set of directional lights
 shared by all texels. Where the field was fitted without shadows
 (``visibility == "factored"``) they are traced, and hits in shadow show the indirect light of
-their texels.
+their texels, with what lit parts of the surface send there (`render.bounced_light`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate, sum_lights
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.options import MOST_WORKERS, available_cores
+from reflfield.render.bounced_light import BouncedLight
 from reflfield.render.camera_rays import (
     FieldSurface,
     Footprints,
@@ -45,6 +46,10 @@ _NODES_AT_ONCE = 1 << 22
 
 # Shadow rays of an environment that are traced together: 80 MB.
 _SHADOW_RAYS_AT_ONCE = 1 << 18
+
+# Lights whose bounced light is worked out together under an environment, and that are kept
+# after an image.
+_BOUNCES_AT_ONCE, _BOUNCES_KEPT = 16, 64
 
 # Least and most of each option.
 RANGES: dict[str, tuple[float, float]] = {
@@ -173,6 +178,10 @@ class Renderer:
         self._environments: dict[object, EnvironmentLighting] = {}
         # Decoded here, before threads could each do it.
         field.decode()
+        traced = field.visibility == "factored" and field.indirect.is_traced
+        self._bounced = BouncedLight(self.surface, self.options.n_threads) if traced else None
+        # With their lights, so that these are not replaced by others of the same identity.
+        self._bounces: dict[int, tuple[Light, NDArray[np.float32]]] = {}
 
     def render(self, camera: Camera, lights: Lighting) -> Rendering:
         """Make one image.
@@ -221,6 +230,7 @@ class Renderer:
         self, camera: Camera, groups: Sequence[Sequence[Light | EnvironmentLighting]]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Image under each group of lights, and their coverage."""
+        self._trace_bounces([s for group in groups for s in group if isinstance(s, Light)])
         images = np.zeros((len(groups), camera.height, camera.width, 3), np.float32)
         coverage = np.zeros((camera.height, camera.width), np.float32)
         blocks = _blocks(pixel_window(camera, self.surface.mesh), self.options.block_pixels)
@@ -230,6 +240,23 @@ class Renderer:
                 images[:, row, column] = radiance
                 coverage[row, column] = covered
         return images, coverage
+
+    def _trace_bounces(self, lights: Sequence[Light]) -> None:
+        """Work out the bounced light of all texels under some lights."""
+        if self._bounced is None:
+            return
+        new = {id(light): light for light in lights if id(light) not in self._bounces}
+        needed = {id(light) for light in lights}
+        old = [key for key in self._bounces if key not in needed]
+        for key in old[: max(len(old) + len(needed) - _BOUNCES_KEPT, 0)]:
+            del self._bounces[key]
+        bounced = self._bounced
+        _ = (bounced.shares, bounced.albedo)
+        with ThreadPoolExecutor(self.options.n_threads) as pool:
+            for light, values in zip(
+                new.values(), pool.map(bounced.under, new.values()), strict=True
+            ):
+                self._bounces[id(light)] = light, values
 
     def _sources(self, lights: Lighting) -> list[Light | EnvironmentLighting]:
         all_lights = [lights] if isinstance(lights, Light | EnvironmentMap) else list(lights)
@@ -261,7 +288,9 @@ class Renderer:
             if opened.world_from_environment is None:
                 opened = opened.turned_to(self.field.up)
             quantised = opened.quantise(self.options.environment_directions)
-            self._environments[key] = EnvironmentLighting(self.surface, quantised)
+            self._environments[key] = EnvironmentLighting(
+                self.surface, quantised, self._bounced, self.options.n_threads
+            )
         return self._environments[key]
 
     def _block(
@@ -314,7 +343,11 @@ class Renderer:
         if not (indirect.is_black or lit.all()):
             power, towards = self.field.inverse_power, source.directions(entries.position)
             in_shadow = entries.summed(~lit)[:, None]
-            total += in_shadow * indirect.towards(entries.texel, towards, power)
+            bounced = None
+            if self._bounced is not None:
+                bounced = self._bounces[id(source)][1][entries.texel]
+            shown = indirect.towards(entries.texel, towards, power, bounced)
+            total += in_shadow * shown
         return total * source.irradiance(entries.position)
 
     def _lit(self, light: Light, hits: SurfaceHits) -> NDArray[np.bool_]:
@@ -338,15 +371,26 @@ class EnvironmentLighting:
         Mesh and texels.
     lights : DistantLights
         Shared by all texels.
+    bounced : BouncedLight, optional
+        Of the field, where it is a part of what texels show in shadows.
+    workers : int
+        Threads.
 
     Notes
     -----
     Radiance is worked out for whole texels, at the texel's own point, and not
     for each sample: under so many lights it changes little within a texel. Shadows do
-    not depend on the camera; once traced they are kept, one bit for each texel and light.
+    not depend on the camera; once traced they are kept, one bit for each texel and light. With
+    bounced light all of them are traced at once, and so is what texels show in them.
     """
 
-    def __init__(self, surface: FieldSurface, lights: DistantLights) -> None:
+    def __init__(
+        self,
+        surface: FieldSurface,
+        lights: DistantLights,
+        bounced: BouncedLight | None = None,
+        workers: int = 1,
+    ) -> None:
         self._surface = surface
         self._lights = lights
         n_texels = surface.field.n_texels
@@ -356,6 +400,30 @@ class EnvironmentLighting:
         self._positions, self._normals = surface.texel_points
         if self._factored:
             self._lit_bits = np.zeros((n_texels, -(-len(lights) // 8)), np.uint8)
+        self._in_shadows = None if bounced is None else self._indirect(bounced, workers)
+
+    def _indirect(self, bounced: BouncedLight, workers: int) -> Array:
+        """Radiance (n_texels, 3) of all texels from the lights that do not reach them."""
+        field, directions = self._surface.field, self._lights.directions
+        texels = np.arange(field.n_texels, dtype=np.int32)
+        _ = (bounced.shares, bounced.albedo)
+
+        def under(first: int) -> Array:
+            part = slice(first, first + _BOUNCES_AT_ONCE)
+            lit = self._lit(texels, part)
+            shown = field.indirect.under(
+                texels,
+                directions[part],
+                field.inverse_power,
+                bounced.of_distant(directions[part].astype(np.float32), lit),
+            )
+            powers = self._lights.irradiances[part]
+            return np.einsum("nmc,mc,nm->nc", shown, powers, ~lit, optimize=True)
+
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(self._lit, np.array_split(texels, max(1, 4 * workers))))
+            parts = pool.map(under, range(0, len(directions), _BOUNCES_AT_ONCE))
+            return np.asarray(sum(parts, start=np.zeros((len(texels), 3))))
 
     def radiance(self, camera: Camera, texels: NDArray[np.int32]) -> Array:
         """Radiance of texels towards the camera, (n, 3) float64."""
@@ -372,17 +440,20 @@ class EnvironmentLighting:
                 self._lights.directions,
                 self._lights.irradiances,
                 self._lit(block) if self._factored else None,
+                indirect=self._in_shadows is None,
             )
+        if self._in_shadows is not None:
+            result += self._in_shadows[distinct]
         return result[where]
 
-    def _lit(self, texels: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """(n, n_lights) bool: True where a light reaches a texel."""
+    def _lit(self, texels: NDArray[np.int32], lights: slice = slice(None)) -> NDArray[np.bool_]:
+        """(n, n_lights) bool: True where a light reaches a texel; of all or some lights."""
         missing = texels[~self._traced[texels]]
         at_once = max(_SHADOW_RAYS_AT_ONCE // len(self._lights), 1)
         for first in range(0, len(missing), at_once):
             self._trace(missing[first : first + at_once])
         bits = np.unpackbits(self._lit_bits[texels], axis=1, count=len(self._lights))
-        return bits.astype(np.bool_)
+        return bits[:, lights].astype(np.bool_)
 
     def _trace(self, texels: NDArray[np.int32]) -> None:
         """Trace and keep; two threads that trace the same texel write the same bits."""

@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 
 from reflfield.capture.encoding import encode_srgb
 from reflfield.field.array_schemas import INDIRECT_ARRAYS, SCHEMAS
+from reflfield.field.build import indirect_arrays
 from reflfield.field.evaluation import evaluate
 from reflfield.field.observed_sphere import covered, table_directions
 from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
 from reflfield.geometry.mesh import Mesh
+from reflfield.options import available_cores
+from reflfield.viewer.baked_shadows import baked_indirect
 
 FORMAT, VERSION = "reflfield-object", 1
 FIRST_ARRAYS = ("positions", "position_box", "faces", "uv", "uv_box")
@@ -180,15 +183,17 @@ def _header(field: ReflectanceField, mesh: Mesh, has_indirect: bool) -> dict[str
 def _indirect_arrays(field: ReflectanceField) -> dict[str, NDArray[Any]]:
     """Functions of indirect light at the nodes of a table over the sphere, and coefficients."""
     nodes = table_directions()
-    values = field.indirect.at(nodes.reshape(-1, 3))
+    light = baked_indirect(field, available_cores())
+    stored = indirect_arrays(light, field.n_texels, float(field.arrays["indirect_scale"][0]))
+    values = light.at(nodes.reshape(-1, 3))
     table = np.moveaxis(values.reshape(*nodes.shape[:2], -1), 2, 0)
     scale = np.abs(table).max(axis=(1, 2), initial=0.0) / TABLE_STEPS
     steps = np.where(scale > 0, scale, 1.0)[:, None, None]
     return {
         "indirect_table": np.rint(table / steps).astype(np.int16),
         "indirect_table_scale": scale.astype(np.float32),
-        "indirect_coefficients": field.arrays["indirect_coefficients"],
-        "indirect_scale": field.arrays["indirect_scale"],
+        "indirect_coefficients": stored["indirect_coefficients"],
+        "indirect_scale": stored["indirect_scale"],
     }
 
 
