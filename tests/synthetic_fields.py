@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.field.build import BaseSurface, FittedReflectance, build_field
+from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.reflectance_field import INVERSE_POWER, Domain, ReflectanceField
 from reflfield.sphere.hemisphere import HemisphereGrid
 from reflfield.sphere.rotations import frames_from_normals
@@ -156,6 +157,7 @@ def baked_field(
     view_side: int = 9,
     light_side: int = 9,
     domain: Domain = "cube_root",
+    indirect: IndirectLight | None = None,
     **options: Any,
 ) -> ReflectanceField:
     """One reflectance on all of a surface, in the base frames.
@@ -170,6 +172,7 @@ def baked_field(
         Sides of the grids.
     domain : {"cube_root", "square_root", "linear"}
         Domain of the field.
+    indirect : IndirectLight, optional
     **options
         Further arguments of `build_field`.
 
@@ -194,6 +197,7 @@ def baked_field(
         mean=mean[None],
         basis=np.zeros((1, 0, *mean.shape)),
         domain=domain,
+        indirect=indirect,
     )
     return build_field(surface, reflectance, **options)
 

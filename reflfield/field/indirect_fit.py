@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import InputError
-from reflfield.observations.texel_reading import Shade
+from reflfield.observations.shade import Shade
 from reflfield.sphere.harmonics import n_coefficients, real_harmonics
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
 from reflfield.observations.image_projection import directions_of
-from reflfield.observations.texel_reading import Shade
+from reflfield.observations.shade import Shade
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]

@@ -19,6 +19,7 @@ from reflfield.observations.resampling_options import (
     ResamplingOptions,
     side_for,
 )
+from reflfield.observations.shade import Shade
 from reflfield.observations.store import (
     LEAST_TEXELS_PER_CHUNK,
     Bools,
@@ -76,25 +77,6 @@ class LocalLuminance:
     samples: Floats
     views: NDArray[np.float64]
     lights: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Shade:
-    """What some texels show where no light reaches them directly.
-
-    Parameters
-    ----------
-    values : (n, n_lights, 3) float32
-        Mean over the views of transformed samples.
-    weights : (n, n_lights, 3) float32
-        Views that measured it; 0 where the light reaches the texel.
-    lights : (n, n_lights, 3) float32
-        Unit vectors, world frame.
-    """
-
-    values: Floats
-    weights: Floats
-    lights: Floats
 
 
 @dataclass(frozen=True)

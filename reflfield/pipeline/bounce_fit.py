@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.observations.shade import Shade
 from reflfield.observations.stored_shade import StoredShade
-from reflfield.observations.texel_reading import Shade
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.indirect import fitted_to_shade

@@ -12,8 +12,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from reflfield.field.indirect_fit import IndirectModel, fit_indirect
+from reflfield.observations.shade import Shade
 from reflfield.observations.stored_shade import StoredShade
-from reflfield.observations.texel_reading import Shade, TexelReader
+from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline import results
 from reflfield.pipeline.atlas import pixel_width
 from reflfield.pipeline.context import Context

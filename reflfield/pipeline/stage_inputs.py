@@ -47,6 +47,11 @@ def compared_digests(context: Context) -> dict[str, str]:
     return {name: context.digest_of(photographs) for name, photographs in sets.items()}
 
 
+def field_options(options: PipelineOptions) -> tuple[Any, ...]:
+    """Options that a field depends on, beside those of the stages before."""
+    return options.compression, options.resampling, options.indirect, options.seed
+
+
 def selection_digests(context: Context) -> dict[str, str]:
     """What candidate runs depend on: the name in their fields, the photographs compared."""
     return {"name": context.capture.name, **compared_digests(context)}

@@ -231,12 +231,7 @@ COMPRESSION = Stage(
         *(OBSERVATIONS, LEFT_OUT_VIEWS, RESAMPLING, INDIRECT),
         *(SURFACE_OBSERVATIONS, SURFACE_INDIRECT),
     ),
-    options=lambda options: (
-        options.compression,
-        options.resampling,
-        options.indirect,
-        options.seed,
-    ),
+    options=stage_inputs.field_options,
     reads=stage_inputs.field_metadata_digest,
 )
 # the field's frames as images, the mesh with its mean texture
@@ -246,12 +241,7 @@ WITHOUT_ALIGNMENT = Stage(
     "without_alignment",
     without_alignment.write_without_alignment,
     after=(COMPRESSION,),
-    options=lambda options: (
-        options.compression,
-        options.resampling,
-        options.indirect,
-        options.seed,
-    ),
+    options=stage_inputs.field_options,
     reads=stage_inputs.field_metadata_digest,
     wanted=lambda context: context.options.compares_without_alignment,
 )

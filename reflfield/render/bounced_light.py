@@ -24,14 +24,21 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from reflfield.capture.lights import Light
 from reflfield.field.evaluation import evaluate, texel_taps
 from reflfield.render.camera_rays import FieldSurface
+from reflfield.util.late_import import LateImport
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+# Of pictures only those with bounced light need it.
+sparse = LateImport("scipy.sparse")
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -100,7 +107,7 @@ class BouncedLight:
             parts = list(pool.map(self._traced, blocks))
         rows, columns = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         share = np.full(len(rows), 1.0 / RAYS_ALONG**2, np.float32)
-        matrix = csr_array((share, (rows, columns)), shape=(n, n))
+        matrix: csr_array = sparse.csr_array((share, (rows, columns)), shape=(n, n))
         matrix.sum_duplicates()
         return matrix
 

@@ -9,7 +9,7 @@ from reflfield.field.indirect_fit import fit_indirect
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.observed_sphere import fibonacci_directions
 from reflfield.field.reflectance_field import ReflectanceField
-from reflfield.observations.texel_reading import Shade
+from reflfield.observations.shade import Shade
 from reflfield.render.bounced_light import BouncedLight
 from reflfield.render.camera_rays import FieldSurface
 

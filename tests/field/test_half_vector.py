@@ -27,6 +27,7 @@ from reflfield.field.half_vector import (
     HalfVectorModel,
 )
 from reflfield.field.half_vector_build import build_half_vector_field
+from reflfield.field.indirect_light import IndirectLight
 from reflfield.sphere.hemisphere import softened_cosine
 from tests.field.test_fuzz_file import with_array
 
@@ -198,10 +199,17 @@ def test_a_file_gives_back_the_field(model, tmp_path):
     assert described.counts["lobes"] == 2
 
 
-def with_header(source, target, **changes):
-    """Copy of a field file whose header differs; a change to None removes an entry."""
+def with_header(source, target, without=(), **changes):
+    """Copy of a field file whose header differs; a change to None removes an entry.
+
+    Arrays `without` which it is are removed, and from the header.
+    """
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        arrays = json.loads(old.read(HEADER))["arrays"]
+        changes = {"arrays": {n: a for n, a in arrays.items() if n not in without}} | changes
         for info in old.infolist():
+            if info.filename.removesuffix(".bin") in without:
+                continue
             content = old.read(info)
             if info.filename == HEADER:
                 header = json.loads(content) | changes
@@ -212,7 +220,9 @@ def with_header(source, target, **changes):
 
 def test_files_of_version_3_are_clustered_fields(make_field, tmp_path):
     write_field(tmp_path / "new.rfld", make_field())
-    with_header(tmp_path / "new.rfld", tmp_path / "old.rfld", version=3, model=None)
+    with_header(
+        tmp_path / "new.rfld", tmp_path / "old.rfld", ["bounce_gain"], version=3, model=None
+    )
     assert open_field(tmp_path / "old.rfld").model == "clustered"
 
 
@@ -258,23 +268,33 @@ def test_numbers_that_are_none_are_one_error_or_finite_samples(written, tmp_path
 
 def test_files_of_version_4_have_lobes_without_skews(model, tmp_path):
     write_field(tmp_path / "new.rfld", built(model))
-    header = json.loads(zipfile.ZipFile(tmp_path / "new.rfld").read(HEADER))
-    arrays = {n: entry for n, entry in header["arrays"].items() if n != "lobe_skews"}
-    with_header(tmp_path / "new.rfld", tmp_path / "all.rfld", version=4, arrays=arrays)
-    with (
-        zipfile.ZipFile(tmp_path / "all.rfld") as old,
-        zipfile.ZipFile(tmp_path / "old.rfld", "w") as new,
-    ):
-        for info in old.infolist():
-            if info.filename != "lobe_skews.bin":
-                new.writestr(info, old.read(info))
+    absent = ["lobe_skews", "bounce_gain"]
+    with_header(tmp_path / "new.rfld", tmp_path / "old.rfld", absent, version=4)
     opened = open_field(tmp_path / "old.rfld")
     texels, views, lights = pairs(50)
     without = built(replace(model, skews=np.zeros_like(model.skews)))
     np.testing.assert_array_equal(
         evaluate(opened, texels, views, lights), evaluate(without, texels, views, lights)
     )
-    # A file of the present version must have them.
+    # A file of a later version must have them.
     with_header(tmp_path / "old.rfld", tmp_path / "cut.rfld", version=5)
+    with pytest.raises(FieldFileError):
+        open_field(tmp_path / "cut.rfld")
+
+
+def test_files_of_version_5_trace_no_bounced_light(model, tmp_path):
+    light = IndirectLight(
+        np.ones((1, 1, 3), np.float32),
+        np.zeros((model.n_texels, 0), np.float32),
+        gain=np.array([1.0, 0.5, 0.0], np.float32),
+    )
+    write_field(tmp_path / "new.rfld", built(model, indirect=light, visibility="factored"))
+    opened = open_field(tmp_path / "new.rfld").indirect
+    np.testing.assert_array_equal(opened.gain, light.gain)
+    with_header(tmp_path / "new.rfld", tmp_path / "old.rfld", ["bounce_gain"], version=5)
+    old = open_field(tmp_path / "old.rfld").indirect
+    assert not old.is_traced
+    np.testing.assert_array_equal(old.functions, opened.functions)
+    with_header(tmp_path / "old.rfld", tmp_path / "cut.rfld", version=6)
     with pytest.raises(FieldFileError):
         open_field(tmp_path / "cut.rfld")

@@ -15,7 +15,7 @@ from reflfield.field.indirect_fit import (
 )
 from reflfield.field.indirect_light import IndirectLight, no_indirect_light
 from reflfield.field.observed_sphere import covered
-from reflfield.observations.texel_reading import Shade
+from reflfield.observations.shade import Shade
 from reflfield.sphere.harmonics import real_harmonics
 from tests.synthetic_fields import square_surface
 
