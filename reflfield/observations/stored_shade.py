@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.capture.capture import Capture
-from reflfield.observations.image_projection import directions_of
+from reflfield.capture.lights import Light
 from reflfield.observations.shade import Shade
 
 Floats = NDArray[np.float32]
@@ -31,8 +30,8 @@ class StoredShade:
         Light of the capture, of each texel ascending.
     unit : float
         Of the values.
-    capture : Capture
-        Whose lights they are.
+    lights : tuple of Light
+        Of the capture.
     positions : (n_texels, 3) float64
         Of all texels.
     """
@@ -42,21 +41,22 @@ class StoredShade:
     weights: NDArray[np.bool_]
     light: NDArray[np.integer[Any]]
     unit: float
-    capture: Capture
+    lights: tuple[Light, ...]
     positions: NDArray[np.float64]
 
     def rows(self, rows: Indices) -> Shade:
         """Shade of some of the texels."""
-        _, lights = directions_of(self.capture, self.positions[self.texels[rows]])
+        points, kept = self.positions[self.texels[rows]], self.light[rows][..., None]
+        towards = [light.directions(points).astype(np.float32) for light in self.lights]
         return Shade(
             values=self.values[rows].astype(np.float32) * np.float32(self.unit),
             weights=self.weights[rows].astype(np.float32),
-            lights=np.take_along_axis(lights, self.light[rows][..., None], axis=1),
+            lights=np.take_along_axis(np.stack(towards, axis=1), kept, axis=1),
         )
 
     def only(self, kept: Indices) -> StoredShade:
         """The shade of some of the texels, as it is kept."""
         return StoredShade(
             *(self.texels[kept], self.values[kept], self.weights[kept], self.light[kept]),
-            *(self.unit, self.capture, self.positions),
+            *(self.unit, self.lights, self.positions),
         )

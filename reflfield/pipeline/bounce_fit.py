@@ -70,6 +70,13 @@ def with_bounced_light(
     return IndirectLight(model.functions(), coefficients, gain=gain)
 
 
+def gain_counts(field: ReflectanceField) -> dict[str, list[float]]:
+    """Gain of each channel of bounced light, for the record of a stage; empty without any."""
+    if not field.indirect.is_traced:
+        return {}
+    return {"gain of bounced light": field.indirect.gain.astype(float).round(3).tolist()}
+
+
 def _of_shade(
     context: Context, traced: BouncedLight, shade: StoredShade, workers: int
 ) -> Floats:
@@ -92,10 +99,20 @@ def _of_shade(
 
 
 def _gain(shade: StoredShade, bounced: Floats) -> Floats:
-    """Least squares of the shade on bounced light, both transformed, channel by channel."""
-    used = shade.weights > 0
-    known = np.where(used, bounced, 0.0)
-    products = (known * shade.values.astype(np.float32)).sum(axis=(0, 1), dtype=np.float64)
-    squares = np.square(known, dtype=np.float64).sum(axis=(0, 1))
-    gain = products * shade.unit / np.where(squares > 0, squares, 1.0)
-    return np.clip(gain, 0.0, LARGEST_GAIN).astype(np.float32)
+    """Slope of the shade over bounced light, both transformed, channel by channel.
+
+    What a light brings to all shadows alike, as stray light does, says nothing: only how much
+    brighter one texel is than others under it.
+    """
+    gain = np.zeros(3, np.float32)
+    for c in range(3):
+        used = shade.weights[..., c]
+        light = shade.light[used]
+        x, y = (a[..., c][used].astype(np.float64) for a in (bounced, shade.values))
+        count = np.maximum(np.bincount(light), 1)
+        mean = np.bincount(light, x) / count
+        squares = np.vdot(x, x) - np.vdot(count, mean**2)
+        products = np.vdot(x, y) - np.vdot(mean, np.bincount(light, y))
+        if squares > 0:
+            gain[c] = np.clip(products * shade.unit / squares, 0.0, LARGEST_GAIN)
+    return gain

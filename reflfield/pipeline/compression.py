@@ -15,6 +15,7 @@ from reflfield.field.file import open_field, write_field
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.pipeline import results
 from reflfield.pipeline.alignment import aligned_frames
+from reflfield.pipeline.bounce_fit import gain_counts
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.completion import completion_of
 from reflfield.pipeline.context import Context
@@ -66,6 +67,7 @@ def write_compressed(texels: Resampled, maker: FieldMaker, folder: Path) -> dict
         "samples not measured": counted.unmeasured,
         "clusters": made.n_clusters,
         "components": made.n_components,
+        **gain_counts(made),
         "field bytes": size,
         "raw bytes": raw,
         "compression ratio": raw / size,

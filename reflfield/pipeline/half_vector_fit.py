@@ -56,7 +56,7 @@ from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.light_agreement import beside_the_view
 from reflfield.pipeline import results
-from reflfield.pipeline.bounce_fit import with_bounced_light
+from reflfield.pipeline.bounce_fit import gain_counts, with_bounced_light
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import readers_at_once, working_bytes
@@ -453,6 +453,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "saturated values, fitted as bounds from below": fitted.n_bounds,
         "of them fitted darker": fitted.n_unmet,
         **made.counts,
+        **gain_counts(made),
         "field bytes": size,
         "raw bytes": raw,
         "compression ratio": raw / size,

@@ -47,7 +47,7 @@ def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
         in_view,
         **kept,
         unit=reader.domain_unit,
-        capture=context.training,
+        lights=context.training.lights,
         positions=results.texels(context).position,
     )
     shade = shade.only(np.flatnonzero(shade.weights.any(axis=(1, 2))))

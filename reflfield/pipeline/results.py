@@ -224,5 +224,5 @@ def shade(context: Context) -> StoredShade:
     stored: dict[str, Any] = arrays(context, "indirect", SHADE)
     unit = float(stored.pop("unit"))
     return StoredShade(
-        **stored, unit=unit, capture=context.training, positions=texels(context).position
+        **stored, unit=unit, lights=context.training.lights, positions=texels(context).position
     )
