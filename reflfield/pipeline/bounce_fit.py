@@ -24,6 +24,8 @@ Indices = NDArray[np.intp]
 # Below this gain in every channel the capture shows no such light. Where surfaces do light each
 # other it is about 1; where a simulation left that out it was below .1.
 LEAST_GAIN = 0.3
+# Lights under which the gain is tried first.
+LIGHTS_TRIED = 16
 # Largest gain: noise and light of the surroundings are not the surface's own.
 LARGEST_GAIN = 1.5
 
@@ -53,14 +55,16 @@ def with_bounced_light(
     if not len(shade.texels):
         return indirect
     field.decode()
-    workers = max(context.resources.workers, 1)
-    traced = BouncedLight(FieldSurface(field), workers)
+    traced = BouncedLight(FieldSurface(field), context.resources.workers)
     if not traced.shares.nnz:
         return indirect
-    bounced = _of_shade(context, traced, shade, workers) ** np.float32(1 / field.inverse_power)
-    gain = _gain(shade, bounced)
-    if (gain < LEAST_GAIN).all():
+    lights, power = np.unique(shade.light[shade.weights.any(axis=2)]), field.inverse_power
+    few = lights[np.linspace(0, len(lights) - 1, min(len(lights), LIGHTS_TRIED)).astype(int)]
+    bounced = _of_shade(context, traced, shade, few) ** np.float32(1 / power)
+    if (_gain(shade, bounced, few) < LEAST_GAIN).all():
         return indirect
+    bounced = _of_shade(context, traced, shade, lights) ** np.float32(1 / power)
+    gain = _gain(shade, bounced, lights)
 
     def read(rows: Indices) -> Shade:
         of_harmonics = shade.rows(rows)
@@ -78,9 +82,9 @@ def gain_counts(field: ReflectanceField) -> dict[str, list[float]]:
 
 
 def _of_shade(
-    context: Context, traced: BouncedLight, shade: StoredShade, workers: int
+    context: Context, traced: BouncedLight, shade: StoredShade, numbers: Indices
 ) -> Floats:
-    """Bounced light as samples where a shade has its own, (n, n_kept, 3)."""
+    """Bounced light of some lights as samples where a shade has its own, (n, n_kept, 3)."""
     lit = results.light_visible(context)
     bounced = np.zeros(shade.values.shape, np.float32)
     lights = context.training.lights
@@ -88,25 +92,25 @@ def _of_shade(
 
     def under(number: int) -> tuple[Indices, Indices, Floats]:
         row, place = np.nonzero(shade.light == number)
-        if not len(row):
-            return row, place, np.zeros((0, 3), np.float32)
         return row, place, traced.under(lights[number], lit[:, number])[shade.texels[row]]
 
-    with ThreadPoolExecutor(workers) as pool:
-        for row, place, values in pool.map(under, range(len(lights))):
+    with ThreadPoolExecutor(traced.workers) as pool:
+        for row, place, values in pool.map(under, numbers.tolist()):
             bounced[row, place] = values
     return bounced
 
 
-def _gain(shade: StoredShade, bounced: Floats) -> Floats:
+def _gain(shade: StoredShade, bounced: Floats, lights: Indices) -> Floats:
     """Slope of the shade over bounced light, both transformed, channel by channel.
+
+    Samples under some of the lights count.
 
     What a light brings to all shadows alike, as stray light does, says nothing: only how much
     brighter one texel is than others under it.
     """
-    gain = np.zeros(3, np.float32)
+    gain, of_lights = np.zeros(3, np.float32), np.isin(shade.light, lights)
     for c in range(3):
-        used = shade.weights[..., c]
+        used = shade.weights[..., c] & of_lights
         light = shade.light[used]
         x, y = (a[..., c][used].astype(np.float64) for a in (bounced, shade.values))
         count = np.maximum(np.bincount(light), 1)
