@@ -177,6 +177,7 @@ class ViewPixels:
 def view_pixels(
     capture: Capture,
     view: int,
+    shown: NDArray[np.intp],
     footprint: Footprint,
     positions: Array,
     reliable: Bools,
@@ -188,6 +189,8 @@ def view_pixels(
     ----------
     capture : Capture
     view : int
+    shown : (n_lights,) int
+        Lights whose photographs are read.
     footprint : Footprint
     positions : (n_texels, 3) float64
     reliable : (n_texels, n_lights) bool
@@ -196,7 +199,6 @@ def view_pixels(
         What 1 stands for, 1/sr.
     """
     photographs = capture.photograph_index[view]
-    shown = np.flatnonzero(photographs >= 0)
     seen = np.zeros(len(positions), np.bool_)
     seen[footprint.texel] = True
     texels = np.flatnonzero(seen)

@@ -60,6 +60,7 @@ from reflfield.pipeline.bounce_fit import gain_counts, with_bounced_light
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import readers_at_once, working_bytes
+from reflfield.pipeline.pixel_shares import Shares, shares_within, some_of, spread_over
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.progress import report
@@ -82,11 +83,6 @@ PIXEL_ROWS = TABLE_ROWS // 2
 # Share of the working memory for samples kept, for pixels, and for derivatives; what is larger
 # goes to files, but for pixels, of which then only some are fitted to.
 SAMPLES_SHARE, PIXELS_SHARE, DERIVATIVES_SHARE = 1 / 6, 1 / 6, 1 / 3
-# Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
-# would take hours, or minutes.
-MOST_PIXELS, MOST_FOOTPRINTS = 32_000_000, 1_500_000
-# Memory of a pixel under a light, and of a pixel with the texels under it.
-VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 # In the folder of the stage.
 MODEL, WHITE = "model.npz", "white"
 # Quantisation step of cube roots of samples over that of white, at a relative step of a half.
@@ -224,7 +220,7 @@ class HalfVectorFit:
         """Pixels of views with photographs, the texels under them as the field is rendered."""
         context, texels = self.context, results.texels(self.context)
         surface = FieldSurface(self.build(model, 0.0))
-        share, seed = self.pixel_share, context.options.seed
+        shares, seed = self.shares, context.options.seed
         # As many photographs at a time as the ceiling of memory allows.
         readers = BoundedSemaphore(readers_at_once(context))
 
@@ -234,10 +230,13 @@ class HalfVectorFit:
                 usable = results.silhouettes(context)[view] >= LEAST_COVERAGE
                 if not context.is_plane:
                     usable &= ~depth_edges(surface.scene, camera, context.options.visibility)
-                drawn = some_of(usable, share, np.random.default_rng([seed, view]))
+                drawn = some_of(usable, shares.pixels, np.random.default_rng([seed, view]))
                 under = footprint_of(surface, camera, drawn, texels.position, texels.normal)
+                shown = np.flatnonzero(context.training.photograph_index[view] >= 0)
+                shown = spread_over(shown, shares.photographs, view)
                 return view_pixels(
-                    context.training, view, under, texels.position, self.reliable, self.white
+                    *(context.training, view, shown, under),
+                    *(texels.position, self.reliable, self.white),
                 )
 
         # Of a view without a photograph only the silhouette is used.
@@ -245,32 +244,29 @@ class HalfVectorFit:
         return list(pool.map(one, photographed.tolist()))
 
     @property
-    def pixel_share(self) -> float:
-        """Share of the pixels that are fitted to."""
-        return min(1.0, *self._most_pixels)
-
-    @property
     def memory_warnings(self) -> list[str]:
         """Says so where it is the ceiling of memory that leaves pixels out."""
-        in_time, in_memory = self._most_pixels
-        if in_memory >= min(1.0, in_time):
+        shares, in_time = self.shares, self._shares_in(np.inf)
+        if shares.values >= in_time.values:
             return []
         return [
-            f"fit to the photographs: {in_memory:.0%} of the pixels, drawn at random, were "
-            "fitted to, since all do not fit below the ceiling of memory"
+            f"fit to the photographs: {shares.pixels:.0%} of the pixels, drawn at random, of "
+            f"{shares.photographs:.0%} of the photographs were fitted to, since all do not fit "
+            "below the ceiling of memory"
         ]
 
     @cached_property
-    def _most_pixels(self) -> tuple[float, float]:
-        """Shares of the pixels that time and memory allow; above 1 where they allow more."""
+    def shares(self) -> Shares:
+        """Shares of pixels and photographs that are fitted to."""
+        return self._shares_in(working_bytes(self.context) * PIXELS_SHARE)
+
+    def _shares_in(self, memory: float) -> Shares:
+        """Shares that time, and so many bytes, allow."""
         training, silhouettes = self.context.training, results.silhouettes(self.context)
         covered = [np.count_nonzero(silhouette >= LEAST_COVERAGE) for silhouette in silhouettes]
         n_photographs = (training.photograph_index >= 0).sum(axis=1)
-        n_values = int(np.dot(covered, n_photographs))
-        n_bytes = VALUE_BYTES * n_values + FOOTPRINT_BYTES * sum(covered)
-        in_memory = working_bytes(self.context) * PIXELS_SHARE
-        in_time = min(MOST_PIXELS / max(n_values, 1), MOST_FOOTPRINTS / max(sum(covered), 1))
-        return in_time, in_memory / max(n_bytes, 1)
+        n_values = max(int(np.dot(covered, n_photographs)), 1)
+        return shares_within(max(int(sum(covered)), 1), n_values, memory)
 
     def allocator(
         self, views: Sequence[ViewPixels], n_lobes: int, folder: Path
@@ -322,18 +318,6 @@ class HalfVectorFit:
             results.measured_texels(context),
             SAMPLES_MEASURED,
         ).psnr_ldr
-
-
-def some_of(
-    usable: NDArray[np.bool_], share: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """About a share of the pixels that are usable, drawn at random; all, if that is 1."""
-    if share >= 1.0:
-        return usable
-    at = np.flatnonzero(usable)
-    some = np.zeros(usable.shape, np.bool_)
-    some.ravel()[at[rng.random(len(at), np.float32) < share]] = True
-    return some
 
 
 def array_in_file(folder: Path, shape: tuple[int, ...]) -> Floats:
@@ -449,7 +433,8 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
         "texels that repeat another": made.n_texels - len(results.measured_texels(context)),
         "samples fitted": counted.fitted,
         "samples not measured": counted.unmeasured,
-        "share of the pixels fitted to": fit.pixel_share,
+        "share of the pixels fitted to": fit.shares.pixels,
+        "share of the photographs fitted to": fit.shares.photographs,
         "saturated values, fitted as bounds from below": fitted.n_bounds,
         "of them fitted darker": fitted.n_unmet,
         **made.counts,

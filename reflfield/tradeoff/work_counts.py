@@ -17,7 +17,6 @@ from reflfield.pipeline.atlas import TYPICAL_USE
 from reflfield.pipeline.cache import StageFolder
 from reflfield.pipeline.compared_photographs import compared_photographs
 from reflfield.pipeline.context import AUTO, Context
-from reflfield.pipeline.half_vector_fit import MOST_PIXELS
 from reflfield.pipeline.hollows import (
     GLANCE_LIGHTS,
     STEREO_PX,
@@ -26,6 +25,7 @@ from reflfield.pipeline.hollows import (
 )
 from reflfield.pipeline.model_selection import can_fit_samples, least_samples
 from reflfield.pipeline.pipeline_options import SMALLEST_TEXTURE, PipelineOptions
+from reflfield.pipeline.pixel_shares import MOST_PIXELS
 
 # Silhouettes that are looked at, and for how long: making them from photographs takes time.
 SAMPLED_VIEWS, SAMPLING_SECONDS = 6, 2.0

@@ -17,9 +17,9 @@ from reflfield.geometry.mesh import read_ply
 from reflfield.geometry.uv_atlas import AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
 from reflfield.options import HoldOut, Resources
-from reflfield.pipeline import half_vector_fit, model_selection, results
-from reflfield.pipeline.half_vector_fit import some_of
+from reflfield.pipeline import half_vector_fit, model_selection, pixel_shares, results
 from reflfield.pipeline.pipeline_options import ComparisonOptions, PipelineOptions
+from reflfield.pipeline.pixel_shares import shares_within, some_of, spread_over
 from reflfield.pipeline.stages import run
 from reflfield.render.renderer import RenderOptions
 
@@ -220,15 +220,51 @@ def test_pixels_are_drawn_evenly_and_all_where_all_fit(rng):
 
 
 @pytest.mark.parametrize(
-    ("in_time", "in_memory", "said"),
-    [(2.0, 0.25, ["25% of the pixels"]), (0.1, 0.25, []), (2.0, 1.5, [])],
+    ("memory", "said"), [(4e7, ["100% of the pixels, drawn at random, of 29%"]), (1e12, [])]
 )
-def test_pixels_left_out_for_want_of_memory_are_told(in_time, in_memory, said):
-    fit = half_vector_fit.HalfVectorFit(None)
-    fit.__dict__["_most_pixels"] = in_time, in_memory
-    assert fit.pixel_share == min(1.0, in_time, in_memory)
+def test_pixels_left_out_for_want_of_memory_are_told(memory, said, monkeypatch):
+    of = half_vector_fit.HalfVectorFit
+    monkeypatch.setattr(
+        of, "_shares_in", lambda fit, most: shares_within(100_000, 7_000_000, most)
+    )
+    fit = of(None)
+    fit.__dict__["shares"] = shares_within(100_000, 7_000_000, memory)
     assert len(fit.memory_warnings) == len(said)
     assert all(text in line for text, line in zip(said, fit.memory_warnings, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("n_pixels", "n_lights", "memory"),
+    [(20_000, 30, 1e12), (3_000_000, 150, 1e12), (3_000_000, 150, 1e8), (9_000_000, 2, 1e12)],
+)
+def test_photographs_are_left_out_before_pixels(n_pixels, n_lights, memory):
+    n_values = n_pixels * n_lights
+    shares = shares_within(n_pixels, n_values, memory)
+    pixels, values = shares.pixels * n_pixels, shares.values * n_values
+    assert pixels <= pixel_shares.MOST_FOOTPRINTS * 1.001
+    assert values <= pixel_shares.MOST_PIXELS * 1.001
+    used = pixel_shares.FOOTPRINT_BYTES * pixels + pixel_shares.VALUE_BYTES * values
+    assert used <= memory * 1.001
+    assert (
+        shares.photographs * n_lights >= min(n_lights, pixel_shares.LEAST_PHOTOGRAPHS) * 0.999
+    )
+    # Something limits what is left out.
+    assert shares.values == 1 or max(
+        pixels / pixel_shares.MOST_FOOTPRINTS,
+        values / pixel_shares.MOST_PIXELS,
+        used / memory,
+    ) == pytest.approx(1)
+
+
+def test_photographs_of_a_view_are_spread_evenly():
+    photographs = np.arange(40, 70)
+    np.testing.assert_array_equal(spread_over(photographs, 1.0, 7), photographs)
+    chosen = [spread_over(photographs, 0.2, view) for view in range(12)]
+    assert {len(c) for c in chosen} == {6}
+    assert all(set(np.diff(c)) == {5} for c in chosen)
+    # All are read in one view or another.
+    assert set(np.concatenate(chosen)) == set(photographs)
+    assert spread_over(photographs[:1], 0.01, 3).tolist() == [40]
 
 
 @pytest.mark.slow
@@ -237,7 +273,7 @@ def test_a_third_of_the_pixels_gives_nearly_the_same_field(
 ):
     record = json.loads((made / "stages" / "compression" / "stage.json").read_text())
     assert record["counts"]["share of the pixels fitted to"] == 1.0
-    monkeypatch.setattr(half_vector_fit, "MOST_PIXELS", 3000)
+    monkeypatch.setattr(pixel_shares, "MOST_FOOTPRINTS", 600)
     half_vector_run(tiny_capture, tmp_path)
     record = json.loads((tmp_path / "stages" / "compression" / "stage.json").read_text())
     assert record["counts"]["share of the pixels fitted to"] < 0.4

@@ -1,0 +1,91 @@
+"""Which pixels of which photographs a fit takes, where all would take too long."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Indices = NDArray[np.intp]
+
+# Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
+# would take hours, or minutes.
+MOST_PIXELS, MOST_FOOTPRINTS = 32_000_000, 1_500_000
+# Photographs of each view that are fitted to at least before pixels are left out: what lies
+# beside a texel in the image is told from it by many pixels, not by many lights.
+LEAST_PHOTOGRAPHS = 8
+# Steps of this share of a view's photographs begin at other ones in each view.
+GOLDEN_SHARE = (5**0.5 - 1) / 2
+# Memory of a pixel under a light, and of a pixel with the texels under it.
+VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
+
+
+class Shares(NamedTuple):
+    """Shares, 0 to 1, of the pixels of each view and of its photographs."""
+
+    pixels: float
+    photographs: float
+
+    @property
+    def values(self) -> float:
+        """Share of the pixels under a light."""
+        return self.pixels * self.photographs
+
+
+def shares_within(n_pixels: int, n_values: int, memory: float) -> Shares:
+    """Shares of pixels and photographs within the limits of time and memory.
+
+    Parameters
+    ----------
+    n_pixels : int
+        Of all views.
+    n_values : int
+        Pixels under a light.
+    memory : float
+        Bytes.
+
+    Examples
+    --------
+    Of 23,000 pixels of each of 150 views under 150 lights a part, of few all:
+
+    >>> shares_within(23_000 * 150, 23_000 * 150 * 150, 1e12)
+    Shares(pixels=0.43478260869565216, photographs=0.14222222222222222)
+    >>> shares_within(1000, 20_000, 1e12)
+    Shares(pixels=1.0, photographs=1.0)
+    """
+    least = min(1.0, LEAST_PHOTOGRAPHS * n_pixels / n_values)
+    pixels = min(1.0, MOST_FOOTPRINTS / n_pixels)
+    photographs = min(1.0, MOST_PIXELS / (pixels * n_values))
+    free = memory / pixels - FOOTPRINT_BYTES * n_pixels
+    photographs = min(photographs, free / (VALUE_BYTES * n_values))
+    if photographs >= least:
+        return Shares(pixels, photographs)
+    of_pixel = VALUE_BYTES * least * n_values + FOOTPRINT_BYTES * n_pixels
+    within = min(MOST_PIXELS / (least * n_values), memory / of_pixel)
+    return Shares(min(pixels, within), least)
+
+
+def spread_over(photographs: Indices, share: float, view: int) -> Indices:
+    """About a share of the photographs of a view, evenly spread; other ones in each view.
+
+    Examples
+    --------
+    >>> spread_over(np.arange(10), 0.3, 0), spread_over(np.arange(10), 0.3, 1)
+    (array([0, 3, 6]), array([2, 5, 8]))
+    """
+    n = min(len(photographs), max(round(share * len(photographs)), 1))
+    places = (np.arange(n) + view * GOLDEN_SHARE % 1.0) * len(photographs) / max(n, 1)
+    return photographs[places.astype(np.intp)]
+
+
+def some_of(
+    usable: NDArray[np.bool_], share: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """About a share of the pixels that are usable, drawn at random; all, if that is 1."""
+    if share >= 1.0:
+        return usable
+    at = np.flatnonzero(usable)
+    some = np.zeros(usable.shape, np.bool_)
+    some.ravel()[at[rng.random(len(at), np.float32) < share]] = True
+    return some
