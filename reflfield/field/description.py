@@ -87,6 +87,7 @@ def describe(reflectance_field: ReflectanceField) -> FieldDescription:
             "domain": f.domain,
             "visibility": f.visibility,
             "light_model": f.light_model,
+            "bounced_light": "traced" if f.indirect.is_traced else "not traced",
         },
         counts={
             "vertices": len(f.positions),

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
 from reflfield.field.half_vector import HalfVectorModel
-from reflfield.fitting.pixel_kernels import N_ROTATIONS
+from reflfield.fitting.pixel_kernels import N_ROTATIONS, add_rows
 from reflfield.fitting.pixel_system import (
     PixelStart,
     ViewPixels,
@@ -226,7 +226,7 @@ def _scattered(
     """Sum of the views' parts, in their order."""
     total = np.zeros(shape)
     for view, part in zip(views, parts, strict=True):
-        total[view.texels] += part
+        add_rows(view.texels, part, total)
     return total
 
 

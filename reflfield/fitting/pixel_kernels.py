@@ -198,6 +198,14 @@ def add_to_unknowns(shown: Any, by_diffuse: Any, others: Any, power: int, y: Any
             y[row, 3 + u] += total
 
 
+@numba.njit(cache=True, nogil=True)
+def add_rows(rows: Any, part: Any, total: Any) -> None:
+    """Add rows (m, U) of single precision to some rows of a total in double precision."""
+    for i in range(len(rows)):
+        for u in range(part.shape[1]):
+            total[rows[i], u] += part[i, u]
+
+
 @numba.njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def _pixel_shown(pixel: Any, geometry: Any, shown: Any, out: Any) -> None:
     """What the texels under a pixel show, by their shares, into `out` (n_lights * 3)."""

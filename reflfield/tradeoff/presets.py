@@ -36,6 +36,7 @@ LADDER: dict[str, Settings] = {
         "texture.texels_per_pixel": 0.8,
         "texture.largest": 256,
         "indirect.n_components": 2,
+        "indirect.bounce": False,
         "completion.passes": 1,
         "completion.rank": 6,
         "alignment.iterations": 1,

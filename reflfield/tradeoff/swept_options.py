@@ -67,6 +67,7 @@ class SweptOption:
             "resampling.light_side": counts.n_lights > 1,
             "indirect.enabled": counts.shades,
             "indirect.n_components": counts.shades,
+            "indirect.bounce": counts.shades,
             # Whose frames are those of photometric stereo, of samples that are not completed.
             **dict.fromkeys(OF_SEARCHED_FRAMES, not counts.one_view),
         }
@@ -101,6 +102,7 @@ SWEPT = (
     SweptOption("compression.half_vector.smoothness", (1e-4, 3e-4, 1e-3), _HALF),
     SweptOption("indirect.n_components", (2, 8, 16), solid=True),
     SweptOption("indirect.enabled", (False, True), solid=True),
+    SweptOption("indirect.bounce", (False, True), solid=True),
     SweptOption("alignment.enabled", (False, True), _CLUSTERS),
     SweptOption("alignment.n_clusters", (1, 2, 4), _CLUSTERS),
     SweptOption("completion.method", ("map", "brand"), _CLUSTERS),

@@ -23,7 +23,8 @@ def test_the_container_shows_the_samples_of_the_field(tmp_path, monkeypatch):
     height, width = field.texel_of_pixel.shape
     assert (read.width, read.height, len(read.views)) == (width, height, 151)
     # Three diffuse channels, and weights of two lobes whose channels are skewed apart.
-    assert line.startswith(("8 components", "3 components"))
+    # Those that are left out are near what single precision loses of the samples.
+    assert 3 <= int(line.split(" components")[0]) <= 8
     column, view, light = 5 * width + 3, 60, 130
     texel = field.texel_of_pixel.ravel()[column]
     world = [d @ field.local_from_world[texel] for d in (read.views[view], read.lights[light])]

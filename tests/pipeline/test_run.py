@@ -137,6 +137,7 @@ class TestWhatARunLeaves:
             "photographs_compared": 1,
             "photographs_used_for_neither": 14,
             "photographs_of_the_field": 45,
+            "photographs_redundant": 0,
         }
         assert set(metrics["mean"]) == measured
         assert metrics["images"][0]["name"].startswith("v")

@@ -31,7 +31,7 @@ def test_all_counts_add_up(finished_context):
     photographs = counts["observations", "photographs"]
     assert photographs.total == 60
     # One of ten views and one of six lights: 9 x 5 projected, the pair compared, 5 + 9 apart.
-    assert list(photographs.parts.values()) == [45, 1, 14]
+    assert list(photographs.parts.values()) == [45, 1, 14, 0]
     values = counts["observations", "values"]
     assert (
         values.total
