@@ -1,7 +1,7 @@
 """The paper's job, 151 x 151 photographs and 256 x 256 texels, on this machine.
 
     python tests/benchmarks/bench_scale.py OUT    # simulate, process, compress, compare
-    python tests/benchmarks/bench_scale.py OUT --model auto
+    python tests/benchmarks/bench_scale.py OUT --model auto [--texels 512]
     python tests/benchmarks/bench_scale.py OUT --kill 5
     python tests/benchmarks/bench_scale.py OUT --kill-worker nanny
     python tests/benchmarks/bench_scale.py OUT --per-texel 64 128 256
@@ -59,6 +59,8 @@ BY_TEXELS = {
 
 MEASURED = ("reflfield.pipeline.stages",)
 CLUSTERED = "clustered"
+# Side of the texture of the paper's job.
+TEXELS = 256
 # Stages in which a worker is killed: those that read or write the samples by blocks.
 LOSING = ("observations", "completion", "alignment", "resampling", "compression")
 
@@ -115,12 +117,14 @@ def say(name: str, seconds: float, cpu: float | None, peak: float) -> None:
 def processed(arguments: argparse.Namespace, capture: Path) -> None:
     """Process the capture, and print what each stage took."""
     clustered = arguments.model == CLUSTERED
-    out = arguments.out / ("run" if clustered else f"run_{arguments.model}")
+    finer = "" if arguments.texels == TEXELS else f"_{arguments.texels}"
+    out = arguments.out / ("run" if clustered else f"run_{arguments.model}{finer}")
     call(*process_words(arguments, capture, out, arguments.texels, 2048))
     timings = json.loads((out / "timings.json").read_text())
     name, title = ("scale", "The paper's job")
     if not clustered:
-        name, title = f"scale_{arguments.model}", f"{title}, the model {arguments.model}"
+        name = f"scale_{arguments.model}{finer}"
+        title = f"{title}, the model {arguments.model}, {arguments.texels} texels a side"
     results = Results(name, title, MEASURED)
     directions, pixels = arguments.directions, arguments.pixels
     size = f"{pixels} pixels, {arguments.texels} texels a side"
@@ -138,7 +142,9 @@ def processed(arguments: argparse.Namespace, capture: Path) -> None:
     print(f"field: {(out / 'field.rfld').stat().st_size / 1e6:.2f} MB")
     results.table("Held-out photographs, 2 views x 2 lights")
     size = (out / "field.rfld").stat().st_size / 1e6
-    results.add({"PSNR, dB": metrics["mean"]["psnr_ldr"], "field, MB": size} | spent)
+    image = metrics["mean"]
+    quality = {"PSNR, dB": image["psnr_ldr"], "SSIM": image["ssim"], "FLIP": image["flip"]}
+    results.add(quality | {"field, MB": size} | spent)
     print(results.write())
 
 
@@ -396,7 +402,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--directions", type=int, default=151, help="cameras, and lights")
     parser.add_argument("--pixels", type=int, default=256, help="side of the photographs")
-    parser.add_argument("--texels", type=int, default=256, help="side of the texture")
+    parser.add_argument("--texels", type=int, default=TEXELS, help="side of the texture")
     parser.add_argument("--points", type=int, default=100, help="true ABRDFs to compare with")
     models = (CLUSTERED, "half_vector", "auto")
     parser.add_argument("--model", choices=models, default=CLUSTERED)
