@@ -94,6 +94,41 @@ def test_what_comes_back_from_a_floor_beside_a_lit_wall(corner):
     np.testing.assert_array_equal(floor[..., 0], floor[..., 2])
 
 
+def test_samples_do_not_depend_on_how_strong_a_light_is(corner, rounding):
+    strong = sun(LOW.direction, irradiance=(30.0, 2.0, 0.5))
+    # A product and a quotient of singles.
+    np.testing.assert_allclose(
+        corner.under(strong), corner.under(LOW), rtol=rounding(np.float32, operations=64)
+    )
+    # A spot that reaches nothing brings nothing.
+    away = Light(
+        "spot",
+        "spot",
+        position=(0.5, 0.5, 3.0),
+        direction=(0.0, 0.0, 1.0),
+        intensity=(1.0, 1.0, 1.0),
+        cone_angle=0.3,
+        falloff_angle=0.2,
+    )
+    assert not corner.under(away).any()
+
+
+def test_near_lamps_light_each_texel_from_its_own_side(corner):
+    """A lamp below the floor's plane, before the wall: its light falls off over the wall."""
+    lamp = Light("lamp", "point", position=(2.0, 0.5, -0.02), intensity=(1.0, 1.0, 1.0))
+    n = SIDE**2
+    positions = corner.surface.texel_points[0]
+    towards = np.array(lamp.position) - positions
+    distance = np.linalg.norm(towards, axis=1)
+    # Radiance of the wall by hand: albedo over pi, the cosine, and the square of the distance.
+    wall = ALBEDO / np.pi * towards[n:, 0] / distance[n:] ** 3
+    wall *= corner.lit(lamp)[n:]
+    sent = np.concatenate([np.zeros(n), wall])
+    expected = ALBEDO * (corner.shares @ sent)[:n] * distance[:n] ** 2
+    # The foot of the cosine adds to the albedo, and interpolation on nodes to the cosine.
+    np.testing.assert_allclose(corner.under(lamp)[:n, 0], expected, rtol=0.03)
+
+
 def test_pictures_show_it_in_shadows_alone():
     field = field_of(corner_surface(), gain=(1.0, 0.5, 0.0))
     camera = overhead(size=10, pixels_per_metre=8.0, cx=1.0, cy=9.0)
