@@ -25,6 +25,8 @@ from reflfield.fitting.texel_sample_fit import (
     with_start_colors,
 )
 
+# Samples that tables are fitted to here: telling numbers of lobes apart takes few.
+LEFT_OUT_ROWS = 100_000
 # Rounds of tables and coefficients of one lobe, and of several, which part slowly.
 ROUNDS, ROUNDS_OF_SEVERAL = 4, 8
 MOST_LOBES = len(START_WIDTHS)
@@ -106,7 +108,10 @@ def left_out_errors(
     errors = []
     for n_lobes in range(1, MOST_LOBES + 1):
         model = with_start_colors(fitted, start_model(frames, n_lobes), pool)
-        model, _ = fit_to_samples(fitted, model, pool, rounds_of(n_lobes), smoothness, seed)
+        rounds = rounds_of(n_lobes)
+        model, _ = fit_to_samples(
+            fitted, model, pool, rounds, smoothness, seed, most_rows=LEFT_OUT_ROWS
+        )
         errors.append(solve_coefficients(measured, model, pool)[1])
     return np.array(errors), nearest_samples_error(fitted, measured, pool)
 

@@ -456,8 +456,23 @@ def fit_to_samples(
     rounds: int,
     smoothness: float,
     seed: int = 0,
+    most_rows: int = TABLE_ROWS,
 ) -> tuple[HalfVectorModel, Sequence[float]]:
     """Rounds of tables and coefficients.
+
+    Parameters
+    ----------
+    blocks : SampleBlocks
+    model : HalfVectorModel
+        Where the rounds begin.
+    pool : ThreadPoolExecutor
+    rounds : int
+    smoothness : float
+        Of the lobes.
+    seed : int
+        Of the samples that are drawn.
+    most_rows : int
+        Samples that the tables are fitted to, about.
 
     Returns
     -------
@@ -465,7 +480,7 @@ def fit_to_samples(
     residuals : sequence of float
         Weighted, before the coefficients of each round.
     """
-    rows = sample_rows(blocks, TABLE_ROWS, seed)
+    rows = sample_rows(blocks, most_rows, seed)
     residuals = []
     for _ in range(rounds):
         model = fit_tables(rows, model, pool, smoothness)

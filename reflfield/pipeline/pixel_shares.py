@@ -11,7 +11,7 @@ Indices = NDArray[np.intp]
 
 # Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
 # would take hours, or minutes.
-MOST_PIXELS, MOST_FOOTPRINTS = 32_000_000, 1_500_000
+MOST_PIXELS, MOST_FOOTPRINTS = 12_000_000, 1_500_000
 # Photographs of each view that are fitted to at least before pixels are left out: what lies
 # beside a texel in the image is told from it by many pixels, not by many lights.
 LEAST_PHOTOGRAPHS = 8
@@ -47,10 +47,10 @@ def shares_within(n_pixels: int, n_values: int, memory: float) -> Shares:
 
     Examples
     --------
-    Of 23,000 pixels of each of 150 views under 150 lights a part, of few all:
+    Of 20,000 pixels of each of 60 views under 40 lights a quarter, of few all:
 
-    >>> shares_within(23_000 * 150, 23_000 * 150 * 150, 1e12)
-    Shares(pixels=0.43478260869565216, photographs=0.14222222222222222)
+    >>> shares_within(20_000 * 60, 20_000 * 60 * 40, 1e12)
+    Shares(pixels=1.0, photographs=0.25)
     >>> shares_within(1000, 20_000, 1e12)
     Shares(pixels=1.0, photographs=1.0)
     """
