@@ -1,4 +1,4 @@
-"""Methods on four captures in one table: ours, with and without alignment, and the paper's.
+"""Methods on four captures, a table of each: ours, with and without alignment, the paper's.
 
     python tests/benchmarks/bench_methods.py                        # all captures that are here
     python tests/benchmarks/bench_methods.py vase dinoSparseRing --out DIR
@@ -14,7 +14,8 @@ the grid alone. All are compared with the same held-out photographs, and with th
 and lights that are not in the capture where it has some. CPU time and peak memory are those of
 the stages that a field needs.
 
-Writes results/methods.json. Rows that the same code has left in DIR are not measured again.
+Writes results/methods_NAME.json. Rows that the same code has left in DIR are not measured
+again.
 """
 
 from __future__ import annotations
@@ -155,17 +156,17 @@ def main():
     if unknown := set(options.names) - set(NAMES):
         parser.error(f"NAME: expected {', '.join(NAMES)}, received {', '.join(unknown)}")
     names = options.names or NAMES
-    results = Results("methods", f"Methods on {', '.join(names)}", MEASURED)
-    results.table("Images, size, time and memory")
     with ExitStack() as stack:
         out = options.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for name in names:
             why = missing(name)
-            if why is None:
-                measure(results, name, out / name)
-            else:
+            if why is not None:
                 print(f"{name}: {why}", file=sys.stderr)
-    print(results.write())
+                continue
+            results = Results(f"methods_{name}", f"Methods on {name}", MEASURED)
+            results.table("Images, size, time and memory")
+            measure(results, name, out / name)
+            print(results.write())
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def pictures(results):
     for name, draw in (
         ("accuracy", alignment_picture),
         ("factorization", completion_picture),
-        ("methods", fit_picture),
+        *((name, fit_picture) for name in by_name if name.startswith("methods_")),
         *((name, sweep_picture) for name in by_name if name.startswith("sweep_")),
     ):
         if name in by_name and (picture := draw(by_name[name]["tables"])) is not None:
