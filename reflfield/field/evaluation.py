@@ -325,9 +325,9 @@ def sum_lights(
         its radiance times its solid angle.
     lit : (n, m) bool, optional
         True where light j reaches texel i; all by default. Where it does not, the texel shows
-        its indirect light, without bounced light.
+        its indirect light, but for bounced light, which has to be traced.
     indirect : bool
-        Whether it does.
+        False leaves texels black under lights that do not reach them.
 
     Returns
     -------

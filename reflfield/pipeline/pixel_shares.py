@@ -12,8 +12,8 @@ Indices = NDArray[np.intp]
 # Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
 # would take hours, or minutes.
 MOST_PIXELS, MOST_FOOTPRINTS = 12_000_000, 1_500_000
-# Photographs of each view that are fitted to at least before pixels are left out: what lies
-# beside a texel in the image is told from it by many pixels, not by many lights.
+# Photographs of each view that are fitted to at least, before pixels are left out: neighbouring
+# texels under one pixel are told apart by many pixels, not by many lights.
 LEAST_PHOTOGRAPHS = 8
 # Steps of this share of a view's photographs begin at other ones in each view.
 GOLDEN_SHARE = (5**0.5 - 1) / 2
