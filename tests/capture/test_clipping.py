@@ -32,6 +32,16 @@ def capture_of(folder, *files):
     return Capture("c", folder, (camera,), (Light("l", "unknown"),), (photograph,), "plane")
 
 
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_each_channel_has_a_limit_of_its_own(rng, channel):
+    stored = rng.uniform(0.1, 0.9, (SIZE, SIZE + 1, 3)).astype(np.float32)
+    stored[3, 5, channel] = stored[7, 2, channel] = 1
+    kinds = kinds_of_stored(stored, integer=True)
+    expected = np.full(stored.shape, MEASURED)
+    expected[[3, 7], [5, 2], channel] = SATURATED
+    np.testing.assert_array_equal(kinds, expected)
+
+
 @pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
 def test_integers_at_either_end_are_no_measurements(tmp_path, radiance, dtype, top):
     codes = np.rint(np.clip(encode_srgb(radiance), 0, 1) * top)

@@ -279,7 +279,8 @@ def test_costs_are_those_of_a_sum_by_brute_force(rng):
     assert (costs[~covered] == OUTSIDE).all()
     for k, offset in enumerate(offsets):
         points = np.stack([x, y, front + offset, np.ones_like(x)], axis=2)
-        for at in ((7, 8), (3, 4), (13, 16), (0, 9)):
+        # Middle and borders: sums over patches begin and end there.
+        for at in ((7, 8), (3, 4), (13, 16), (0, 9), (1, 6), (1, 9), (2, 8), (12, 7), (7, 1)):
             if not covered[at]:
                 continue
             each = []
