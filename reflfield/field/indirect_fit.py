@@ -20,8 +20,10 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import isqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +31,7 @@ from numpy.typing import NDArray
 from reflfield.errors import InputError
 from reflfield.observations.shade import Shade
 from reflfield.sphere.harmonics import n_coefficients, real_harmonics
+from reflfield.util.blas_threads import one_core_blas
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -180,11 +183,52 @@ def band_limit_for(n_lights: int) -> int:
     return int(np.clip(int((n_lights / 2) ** 0.5), 1, BAND_LIMIT))
 
 
+def fit_to_shade(
+    read: Callable[[Indices], Shade],
+    texels: Indices,
+    n_lights: int,
+    n_components: int,
+    *,
+    most: int,
+    seed: int = 0,
+    workers: int = 1,
+) -> tuple[IndirectModel, Floats]:
+    """Distribution of indirect light over texels, and the coefficients of each.
+
+    Parameters
+    ----------
+    read : callable
+        Shade of some texels.
+    texels : (n,) int
+        Those that have any.
+    n_lights, n_components : int
+        As of `fit_indirect`.
+    most : int
+        Texels, drawn at random, that shape the distribution.
+    seed : int
+    workers : int
+        Threads; the result does not depend on their number.
+
+    Returns
+    -------
+    model : IndirectModel
+    coefficients : (n, K) float32
+    """
+    rng = np.random.default_rng(seed)
+    training = np.sort(rng.choice(texels, min(len(texels), most), replace=False))
+    blocks = np.array_split(texels, max(1, len(texels) // TEXELS_AT_ONCE))
+    with one_core_blas(), ThreadPoolExecutor(max(workers, 1)) as pool:
+        model = fit_indirect(read, training, n_lights, n_components, pool)
+        coefficients = list(pool.map(lambda block: model.coefficients(read(block)), blocks))
+    return model, np.concatenate(coefficients)
+
+
 def fit_indirect(
     read: Callable[[Indices], Shade],
     texels: Indices,
     n_lights: int,
     n_components: int,
+    pool: ThreadPoolExecutor,
 ) -> IndirectModel:
     """Distribution of indirect light over texels.
 
@@ -197,6 +241,8 @@ def fit_indirect(
     n_lights : int
     n_components : int
         Basis functions at most.
+    pool : ThreadPoolExecutor
+        Threads; the model does not depend on their number.
 
     Returns
     -------
@@ -211,7 +257,7 @@ def fit_indirect(
         raise InputError(f"n_components: expected >= 0, received {n_components}")
     band_limit = band_limit_for(n_lights)
     blocks = np.array_split(texels, max(1, -(-len(texels) // TEXELS_AT_ONCE)))
-    systems = [Systems.of(read(block), band_limit) for block in blocks]
+    systems = list(pool.map(lambda block: Systems.of(read(block), band_limit), blocks))
     size = _root_mean_square(systems, band_limit)
     if not size > 0:
         nothing = np.zeros(3 * n_coefficients(band_limit))
@@ -220,7 +266,7 @@ def fit_indirect(
     systems = [system.divided_by(size) for system in systems]
     model = _initial(systems, band_limit)
     for _ in range(ROUNDS):
-        model = _maximised(systems, model)
+        model = _maximised(systems, model, pool)
     values, vectors = np.linalg.eigh(model.covariance)
     order = np.argsort(-values, kind="stable")[:n_components]
     kept = order[values[order] > LEAST_SHARE]
@@ -259,28 +305,34 @@ def _initial(systems: list[Systems], band_limit: int) -> _Gaussian:
     return _Gaussian(mean, np.diag(FIRST_SPREAD * 4 * np.pi / (1.0 + smooth)), FIRST_NOISE)
 
 
-def _maximised(systems: list[Systems], before: _Gaussian) -> _Gaussian:
+def _maximised(
+    systems: list[Systems], before: _Gaussian, pool: ThreadPoolExecutor
+) -> _Gaussian:
     """One round of expectation maximisation."""
-    one = np.eye(len(before.mean))
-    total, outer = np.zeros_like(before.mean), np.zeros_like(before.covariance)
-    residual, count, n = 0.0, 0.0, 0
-    for s in systems:
-        # Texels without samples are excluded.
-        seen = s.count > 0
-        gram, moments = s.gram[seen], s.moments[seen]
-        # Without inverting the covariance, which may be nearly singular.
-        ratio = one + before.covariance @ gram / before.noise
-        spread = np.linalg.solve(ratio, np.broadcast_to(before.covariance, ratio.shape))
-        left = (moments - gram @ before.mean) / before.noise
-        posterior = before.mean + (spread @ left[..., None])[..., 0]
-        total += posterior.sum(axis=0)
-        outer += posterior.T @ posterior + spread.sum(axis=0)
-        # Expected squared residual: of the posterior mean, and of its uncertainty.
-        fitted = ((gram @ posterior[..., None])[..., 0] - 2.0 * moments) * posterior
-        residual += float(s.energy[seen].sum() + fitted.sum() + np.sum(spread * gram))
-        count += float(s.count[seen].sum())
-        n += int(seen.sum())
-    mean = total / n
+    parts = pool.map(lambda system: _expected(system, before), systems)
+    total, outer, residual, count, n = (sum(sums) for sums in zip(*parts, strict=True))
+    mean = np.asarray(total / n)
     covariance = outer / n - np.outer(mean, mean)
-    covariance = 0.5 * (covariance + covariance.T) + LEAST_SHARE * one
-    return _Gaussian(mean, covariance, max(residual / count, LEAST_SHARE))
+    covariance = 0.5 * (covariance + covariance.T) + LEAST_SHARE * np.eye(len(mean))
+    return _Gaussian(mean, covariance, max(float(residual / count), LEAST_SHARE))
+
+
+def _expected(system: Systems, before: _Gaussian) -> tuple[Any, ...]:
+    """Sums over texels: coefficients, their products, squared residuals, samples, texels."""
+    # Texels without samples are excluded.
+    seen = system.count > 0
+    gram, moments = system.gram[seen], system.moments[seen]
+    # Without inverting the covariance, which may be nearly singular.
+    ratio = np.eye(len(before.mean)) + before.covariance @ gram / before.noise
+    spread = np.linalg.solve(ratio, np.broadcast_to(before.covariance, ratio.shape))
+    left = (moments - gram @ before.mean) / before.noise
+    posterior = before.mean + (spread @ left[..., None])[..., 0]
+    # Expected squared residual: of the posterior mean, and of its uncertainty.
+    fitted = ((gram @ posterior[..., None])[..., 0] - 2.0 * moments) * posterior
+    return (
+        posterior.sum(axis=0),
+        posterior.T @ posterior + spread.sum(axis=0),
+        float(system.energy[seen].sum() + fitted.sum() + np.sum(spread * gram)),
+        float(system.count[seen].sum()),
+        int(seen.sum()),
+    )

@@ -17,6 +17,7 @@ from reflfield.field.half_vector_batches import (
     BATCH,
     COSINE,
     LIGHT,
+    SPREAD,
     VIEW,
     diffuse_at,
     empty_batch,
@@ -27,7 +28,6 @@ from reflfield.field.half_vector_batches import (
     sample_at,
     skew_place,
 )
-from reflfield.field.half_vector_batches import SPREAD as SPREAD_AT
 from reflfield.fitting.robust_weights import HUBER, is_evidence, squared_weight
 from reflfield.util.single_precision import FAST
 
@@ -84,7 +84,7 @@ def _by_coefficients(n: int, batch: Any, pairs: Any, tables: Any, out: Any) -> N
     for i in range(n):
         row, j = pairs[0, i], pairs[1, i]
         by_diffuse[row, j] = numbers[COSINE + i] * diffuse_at(i, batch, table)
-        factor = numbers[COSINE + i] * numbers[SPREAD_AT + i]
+        factor = numbers[COSINE + i] * numbers[SPREAD + i]
         lobe, skew = lobe_place(i, batch), skew_place(i, batch)
         for k in range(lobes[0].shape[0]):
             for c in range(3):

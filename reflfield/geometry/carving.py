@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.errors import GeometryError
 from reflfield.geometry.cones import View
+from reflfield.util.even_order import even_order
 
 Array = NDArray[np.float64]
+Number = TypeVar("Number", bound=np.generic)
 
 # Allowance on the slope of the signed distance, for its error far from the outline.
 _SLOPE_ALLOWANCE = 1.1
@@ -50,8 +54,19 @@ class Grid:
         return cls(origin, spacing, (nx, ny, nz), n_levels)
 
 
-def carve(views: Sequence[View], grid: Grid, tolerance: int) -> tuple[NDArray[np.float32], int]:
+def carve(
+    views: Sequence[View], grid: Grid, tolerance: int, workers: int = 1
+) -> tuple[NDArray[np.float32], int]:
     """Signed distances at the corners of all voxels, exact near the surface.
+
+    Parameters
+    ----------
+    views : sequence of View
+    grid : Grid
+    tolerance : int
+        Views that may disagree at a point without carving it away.
+    workers : int
+        Threads; the volume does not depend on their number.
 
     Returns
     -------
@@ -67,14 +82,14 @@ def carve(views: Sequence[View], grid: Grid, tolerance: int) -> tuple[NDArray[np
         undecided = np.argwhere(state == 0)
         centres = grid.origin + (undecided + 0.5) * (grid.spacing * (1 << level))
         band = slope * 0.5 * np.sqrt(3.0) * grid.spacing * (1 << level)
-        values = smallest_distance(views, centres, tolerance, band)
+        values = smallest_distance(views, centres, tolerance, band, workers)
         n_evaluated += len(centres)
         if not (values > -band).any() and not (state > 0).any():
             refuse_empty(views[first_emptying(views, centres, tolerance, band)])
         decided = np.where(values > band, 1, np.where(values < -band, -1, 0))
         state[tuple(undecided.T)] = decided
         state = _halved(state)
-    return _corner_values(views, grid, state, tolerance, n_evaluated)
+    return _corner_values(views, grid, state, tolerance, n_evaluated, workers)
 
 
 def _halved(state: NDArray[np.int8]) -> NDArray[np.int8]:
@@ -85,13 +100,19 @@ def _halved(state: NDArray[np.int8]) -> NDArray[np.int8]:
 
 
 def _corner_values(
-    views: Sequence[View], grid: Grid, state: NDArray[np.int8], tolerance: int, n_evaluated: int
+    views: Sequence[View],
+    grid: Grid,
+    state: NDArray[np.int8],
+    tolerance: int,
+    n_evaluated: int,
+    workers: int,
 ) -> tuple[NDArray[np.float32], int]:
     """Evaluate the corners of undecided voxels; the others only have a sign."""
     volume = np.where(_at_corners(state > 0), np.float32(FARTHEST), np.float32(-FARTHEST))
     corners = np.argwhere(_at_corners(state == 0))
     points = grid.origin + corners * grid.spacing
-    values = smallest_distance(views, points, tolerance, FARTHEST * grid.spacing)
+    cutoff = FARTHEST * grid.spacing
+    values = smallest_distance(views, points, tolerance, cutoff, workers)
     if not ((values > 0.0).any() or (state > 0).any()):
         refuse_empty(views[first_emptying(views, points, tolerance, 0.0)])
     in_voxels = np.clip(values / grid.spacing, -FARTHEST, FARTHEST)
@@ -116,36 +137,69 @@ def _at_corners(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def smallest_distance(
-    views: Sequence[View], points: Array, tolerance: int, cutoff: float
+    views: Sequence[View], points: Array, tolerance: int, cutoff: float, workers: int = 1
 ) -> Array:
     """Signed distance (n,) that only `tolerance` views undercut, metres.
 
     Points found below ``-cutoff`` are not followed further: their value is some number
     below ``-cutoff``.
     """
-    if tolerance > _MOST_SORTED:
-        return _partitioned_distance(views, points, tolerance)
+    with ThreadPoolExecutor(max(workers, 1)) as pool:
+        if tolerance <= _MOST_SORTED:
+            return _sorted_distance(views, points, tolerance, cutoff, pool)
+
+        def of_part(part: Array) -> Array:
+            return _partitioned_distance(views, part, tolerance, cutoff)
+
+        return np.concatenate(list(pool.map(of_part, _parts(points, _PARTITIONED_POINTS))))
+
+
+def _parts(points: NDArray[Number], size: int) -> list[NDArray[Number]]:
+    """Views of a list by so many at a time; at least one."""
+    return [points[begin : begin + size] for begin in range(0, max(len(points), 1), size)]
+
+
+def _sorted_distance(
+    views: Sequence[View],
+    points: Array,
+    tolerance: int,
+    cutoff: float,
+    pool: ThreadPoolExecutor,
+) -> Array:
+    """`smallest_distance` by lists of the lowest values, one view after the other.
+
+    Their distances may be in files.
+    """
     lowest = np.full((tolerance + 1, len(points)), np.inf)
     alive = np.arange(len(points))
-    # One view after the other: their distances may be in files.
     for view in views:
-        for begin in range(0, len(alive), _BLOCK_POINTS):
-            some = alive[begin : begin + _BLOCK_POINTS]
+
+        def insert(some: NDArray[np.intp], view: View = view) -> None:
             _insert(lowest, some, view.distance(points[some]))
+
+        list(pool.map(insert, _parts(alive, _BLOCK_POINTS)))
         alive = alive[lowest[-1, alive] >= -cutoff]
     values: Array = lowest[-1]
     return values
 
 
-def _partitioned_distance(views: Sequence[View], points: Array, tolerance: int) -> Array:
-    """`smallest_distance` without a cutoff, block by block; infinite without enough views."""
-    values = np.full(len(points), np.inf)
-    for begin in range(0, len(points), _PARTITIONED_POINTS):
-        some = slice(begin, begin + _PARTITIONED_POINTS)
-        of_views = np.stack([view.distance(points[some]) for view in views], axis=1)
-        if tolerance < len(views):
-            values[some] = np.partition(of_views, tolerance, axis=1)[:, tolerance]
-    return values
+def _partitioned_distance(
+    views: Sequence[View], points: Array, tolerance: int, cutoff: float
+) -> Array:
+    """`smallest_distance` of many views; infinite without enough of them."""
+    if tolerance >= len(views):
+        return np.full(len(points), np.inf)
+    of_views = np.full((len(points), len(views)), np.inf)
+    alive, n_below = np.arange(len(points)), np.zeros(len(points), np.intp)
+    # Neighbours see alike: views from all sides end the pursuit of an empty point sooner.
+    for number in even_order(len(views)):
+        distance = views[number].distance(points[alive])
+        of_views[alive, number] = distance
+        n_below[alive] += distance < -cutoff
+        alive = alive[n_below[alive] <= tolerance]
+        if not len(alive):
+            break
+    return np.asarray(np.partition(of_views, tolerance, axis=1)[:, tolerance])
 
 
 def _insert(lowest: Array, columns: NDArray[np.intp], values: Array) -> None:

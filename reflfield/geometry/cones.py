@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +64,7 @@ def measured_views(
     cameras: Sequence[Camera],
     silhouettes: Sequence[NDArray[np.floating]],
     scratch: Path | None = None,
+    workers: int = 1,
 ) -> list[View]:
     """Check and measure the silhouettes; with a folder, distances are kept in files there."""
     if len(cameras) != len(silhouettes) or not cameras:
@@ -70,9 +72,9 @@ def measured_views(
             f"silhouettes: expected one for each of {len(cameras)} cameras (at least one), "
             f"received {len(silhouettes)}"
         )
-    views: list[View] = []
-    pairs = zip(cameras, silhouettes, strict=True)
-    for camera, silhouette in track(pairs, len(cameras), "silhouettes"):
+
+    def measured(number: int) -> View:
+        camera, silhouette = cameras[number], silhouettes[number]
         if np.shape(silhouette) != (camera.height, camera.width):
             raise InputError(
                 f"silhouette of view {camera.id!r}: expected {camera.height} rows x "
@@ -80,9 +82,12 @@ def measured_views(
             )
         outline = signed_distance(silhouette, f"silhouette of view {camera.id!r}")
         if scratch is not None:
-            outline = outline.moved_to(scratch / f"distances{len(views)}.npy")
-        views.append(View(camera, outline))
-    return views
+            outline = outline.moved_to(scratch / f"distances{number}.npy")
+        return View(camera, outline)
+
+    n = len(cameras)
+    with ThreadPoolExecutor(max(workers, 1)) as pool:
+        return list(track(pool.map(measured, range(n)), n, "silhouettes"))
 
 
 def normalised(camera: Camera, pixels: Array) -> Array:

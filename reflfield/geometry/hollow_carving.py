@@ -119,7 +119,7 @@ def carved_hollows(
         return None
     on_hull = depths = search_depths(views, RayScene(hull), 1, n_threads)
     grid = Grid.around(*hull_box(outlines, options, tolerance), options.resolution)
-    volume, _ = carve(outlines, grid, tolerance)
+    volume, _ = carve(outlines, grid, tolerance, n_threads)
     kept = volume
     for again in reversed(range(ROUNDS)):
         kept = np.minimum(kept, _votes(kept, grid, depths))

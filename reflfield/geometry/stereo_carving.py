@@ -71,7 +71,7 @@ def carved_by_stereo(
     towards = np.concatenate([view.camera.view_directions(middle) for view in views])
     stereo = PatchStereo(views, scene, spread_views(towards, MOST_VIEWS), n_threads)
     grid = Grid.around(*hull_box(outlines, options, tolerance), options.resolution)
-    volume, _ = carve(outlines, grid, tolerance)
+    volume, _ = carve(outlines, grid, tolerance, n_threads)
     mesh = None
     # Fewer triangles are of use to the charts alone.
     fine = replace(options, n_triangles=0)

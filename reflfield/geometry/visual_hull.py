@@ -191,6 +191,7 @@ def visual_hull(
     *,
     scratch: Path | None = None,
     made: bool = False,
+    workers: int = 1,
 ) -> tuple[Mesh, HullReport]:
     """Watertight mesh of the visual hull, smoothed and decimated.
 
@@ -208,6 +209,8 @@ def visual_hull(
         instead of in memory. The hull is the same.
     made : bool
         Whether the silhouettes were made from photographs; see `HullOptions.tolerance`.
+    workers : int
+        Threads; the hull does not depend on their number.
 
     Returns
     -------
@@ -230,14 +233,15 @@ def visual_hull(
     Time grows with the square of the resolution and linearly with the views.
     """
     options = options or HullOptions()
-    views = measured_views(cameras, silhouettes, scratch)
+    views = measured_views(cameras, silhouettes, scratch, workers)
     views, silhouettes, specks = without_specks(views, silhouettes, scratch)
     bears_wrong = made and options.tolerance == AUTO and len(views) >= _MANY_MADE
     n_wrong = len(views) // MADE_VIEWS_PER_WRONG if bears_wrong else 0
     with noting_small_parts(views):
-        outcome = _hull_of_made(views, silhouettes, options, n_wrong) if n_wrong else None
+        carver = _Carver(options, workers)
+        outcome = _hull_of_made(views, silhouettes, carver, n_wrong) if n_wrong else None
         if outcome is None:
-            outcome = _agreed_hull(views, silhouettes, options, scratch)
+            outcome = _agreed_hull(views, silhouettes, carver, scratch)
     grid, mesh = outcome.carved.grid, outcome.carved.mesh
     agreement = outcome.fit or _agreement(mesh, cameras, silhouettes)
     report = HullReport(
@@ -280,22 +284,31 @@ class _Outcome:
     fit: _Agreement | None = None
 
 
-def _carved(views: Sequence[View], options: HullOptions, tolerance: int) -> _Carved:
-    low, high = np.array(options.bounds or object_bounds(views, tolerance))
-    grid = Grid.around(low, high, options.resolution)
-    volume, n_evaluated = carve(views, grid, tolerance)
-    return _Carved(closed_surface(volume, grid, options, views), grid, n_evaluated, tolerance)
+@dataclass(frozen=True)
+class _Carver:
+    """Carves views as options say, with so many threads."""
+
+    options: HullOptions
+    workers: int
+
+    def carved(self, views: Sequence[View], tolerance: int) -> _Carved:
+        options = self.options
+        low, high = np.array(options.bounds or object_bounds(views, tolerance))
+        grid = Grid.around(low, high, options.resolution)
+        volume, n_evaluated = carve(views, grid, tolerance, self.workers)
+        mesh = closed_surface(volume, grid, options, views)
+        return _Carved(mesh, grid, n_evaluated, tolerance)
 
 
 def _hull_of_made(
     views: Sequence[View],
     silhouettes: Sequence[NDArray[np.floating]],
-    options: HullOptions,
+    carver: _Carver,
     n_wrong: int,
 ) -> _Outcome | None:
     """Hull that so many views may undercut; None where the silhouettes hardly agree with it."""
     try:
-        carved = _carved(views, options, n_wrong)
+        carved = carver.carved(views, n_wrong)
     except GeometryError:
         return None
     fit = _agreement(carved.mesh, [view.camera for view in views], silhouettes)
@@ -305,14 +318,14 @@ def _hull_of_made(
 def _agreed_hull(
     views: Sequence[View],
     silhouettes: Sequence[NDArray[np.floating]],
-    options: HullOptions,
+    carver: _Carver,
     scratch: Path | None,
 ) -> _Outcome:
     """Hull of all views, or of those that agree, as `options.tolerance` says."""
-    cameras = [view.camera for view in views]
+    cameras, options = [view.camera for view in views], carver.options
     tolerance = 0 if options.tolerance == AUTO else int(options.tolerance)
     try:
-        carved, failure = _carved(views, options, tolerance), None
+        carved, failure = carver.carved(views, tolerance), None
     except GeometryError as error:
         carved, failure = None, error
     fit = None if carved is None else _agreement(carved.mesh, cameras, silhouettes)
@@ -321,7 +334,7 @@ def _agreed_hull(
     disagreement = Disagreement.of(views, options.bounds)
     if disagreement.outliers:
         usable = carved if fit is not None and np.median(fit.overlap) > _COLLAPSED else None
-        return _outcome_with_outliers(views, silhouettes, options, disagreement, usable)
+        return _outcome_with_outliers(views, silhouettes, carver, disagreement, usable)
     if carved is not None and disagreement.agree:
         return _Outcome(carved)
     covered = disagreement.covered if carved else 0.0
@@ -347,14 +360,15 @@ def _agreed_hull(
 def _outcome_with_outliers(
     views: Sequence[View],
     silhouettes: Sequence[NDArray[np.floating]],
-    options: HullOptions,
+    carver: _Carver,
     disagreement: Disagreement,
     usable: _Carved | None,
 ) -> _Outcome:
     """Hull without the views that contradict the others, or with them, as options say."""
     kept = [view for i, view in enumerate(views) if i not in disagreement.outliers]
+    options = carver.options
     try:
-        others = _carved(kept, options, 0)
+        others = carver.carved(kept, 0)
     except GeometryError:
         others = None
     contradictions = tuple(_contradictions(views, silhouettes, disagreement, others))

@@ -52,7 +52,6 @@ from reflfield.fitting.texel_sample_fit import (
     start_model,
     with_start_colors,
 )
-from reflfield.geometry.occlusion import depth_edges
 from reflfield.metrics.sample_residual import sample_error
 from reflfield.observations.light_agreement import beside_the_view
 from reflfield.pipeline import results
@@ -229,7 +228,7 @@ class HalfVectorFit:
             with readers:
                 usable = results.silhouettes(context)[view] >= LEAST_COVERAGE
                 if not context.is_plane:
-                    usable &= ~depth_edges(surface.scene, camera, context.options.visibility)
+                    usable &= ~results.depth_edges(context, view)
                 drawn = some_of(usable, shares.pixels, np.random.default_rng([seed, view]))
                 under = footprint_of(surface, camera, drawn, texels.position, texels.normal)
                 shown = np.flatnonzero(context.training.photograph_index[view] >= 0)

@@ -14,14 +14,13 @@ from reflfield.capture.inspect import object_centre
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT
 from reflfield.errors import InputError
 from reflfield.options import HoldOut
+from reflfield.util.even_order import GOLDEN_SHARE
 
 Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 # Of views or lights with many photographs, so many are compared: more are redundant.
 MOST_COMPARED = 64
-# Steps of this share of the lights leave the most even gaps, however many there are.
-GOLDEN_SHARE = (5**0.5 - 1) / 2
 # Of dense domes at least so many lights make the field, if each has as many photographs.
 LEAST_LIGHTS = 32
 # Which of the photographs that do not make the field it is compared with.

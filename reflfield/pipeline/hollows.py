@@ -98,7 +98,8 @@ class HullViews:
         silhouettes = results.silhouettes(context)
         chosen = [silhouettes[i] for i in self.numbers]
         cameras = [context.training.cameras[i] for i in self.numbers]
-        return list(without_specks(measured_views(cameras, chosen), chosen, None)[0])
+        views = measured_views(cameras, chosen, workers=context.resources.workers)
+        return list(without_specks(views, chosen, None)[0])
 
 
 def _hull_views(context: Context) -> HullViews:

@@ -61,11 +61,18 @@ def _carved(context: Context, folder: Path) -> tuple[Mesh, HullReport]:
     cameras, options = context.training.cameras, context.options.hull
     silhouettes = results.silhouettes(context)
     made = _is_made(context, 0)
+
+    def carved(scratch: Path | None) -> tuple[Mesh, HullReport]:
+        workers = context.resources.workers
+        return visual_hull(
+            cameras, silhouettes, options, scratch=scratch, made=made, workers=workers
+        )
+
     try:
         if keeps_distances(context):
-            return visual_hull(cameras, silhouettes, options, made=made)
+            return carved(None)
         with TemporaryDirectory(dir=folder) as scratch:
-            return visual_hull(cameras, silhouettes, options, scratch=Path(scratch), made=made)
+            return carved(Path(scratch))
     except GeometryError as error:
         if made:
             raise GeometryError(f"{error}; {_MADE}") from error

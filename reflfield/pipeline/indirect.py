@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from reflfield.field.indirect_fit import IndirectModel, fit_indirect
+from reflfield.field.indirect_fit import IndirectModel, fit_to_shade
 from reflfield.observations.shade import Shade
 from reflfield.observations.stored_shade import StoredShade
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline import results
 from reflfield.pipeline.atlas import pixel_width
 from reflfield.pipeline.context import Context
+from reflfield.util.even_order import even_order
 
 # Texels so near to one that the light reaches, in texel spacings and not less than a pixel, are
 # at the edge of a shadow: their pixels mix both.
@@ -25,8 +26,6 @@ EDGE_SPACINGS = 1.5
 # Lights of each texel that are kept where each is that of a few photographs: those with samples
 # in its shadow, and others spread evenly, under which no texel may come out brighter.
 MOST_LIGHTS = 48
-# Steps of this share of the lights leave the most even gaps.
-GOLDEN_SHARE = (5**0.5 - 1) / 2
 
 
 def write_indirect(context: Context, folder: Path) -> dict[str, Any]:
@@ -88,15 +87,19 @@ def fitted_to_shade(
     read : callable
         Shade of some rows of that.
     """
-    options, n_in_shade = context.options.indirect, len(shade.texels)
-    rng = np.random.default_rng(context.options.seed)
-    n = min(n_in_shade, options.training_texels)
-    training = np.sort(rng.choice(n_in_shade, n, replace=False))
-    model = fit_indirect(read, training, context.training.n_lights, options.n_components)
-    coefficients = np.zeros((len(shade.positions), len(model.variances)), np.float32)
+    options = context.options.indirect
+    model, of_shade = fit_to_shade(
+        read,
+        np.arange(len(shade.texels)),
+        context.training.n_lights,
+        options.n_components,
+        most=options.training_texels,
+        seed=context.options.seed,
+        workers=context.resources.workers,
+    )
     # Of the others nothing but the mean is known.
-    for rows in np.array_split(np.arange(n_in_shade), max(1, n_in_shade // 1024)):
-        coefficients[shade.texels[rows]] = model.coefficients(read(rows))
+    coefficients = np.zeros((len(shade.positions), of_shade.shape[1]), np.float32)
+    coefficients[shade.texels] = of_shade
     return model, coefficients
 
 
@@ -144,7 +147,7 @@ def lights_kept(used: NDArray[np.bool_], most: int = MOST_LIGHTS) -> NDArray[np.
     array([[0, 3, 5]])
     """
     n_lights = used.shape[1]
-    rank = np.argsort(np.argsort(np.arange(n_lights) * GOLDEN_SHARE % 1.0))
+    rank = np.argsort(even_order(n_lights))
     order = np.argsort(np.where(used, rank - n_lights, rank), axis=1)
     return np.sort(order[:, :most], axis=1)
 

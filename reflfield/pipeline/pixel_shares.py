@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.util.even_order import GOLDEN_SHARE
+
 Indices = NDArray[np.intp]
 
 # Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
@@ -15,8 +17,6 @@ MOST_PIXELS, MOST_FOOTPRINTS = 12_000_000, 1_500_000
 # Photographs of each view that are fitted to at least, before pixels are left out: neighbouring
 # texels under one pixel are told apart by many pixels, not by many lights.
 LEAST_PHOTOGRAPHS = 8
-# Steps of this share of a view's photographs begin at other ones in each view.
-GOLDEN_SHARE = (5**0.5 - 1) / 2
 # Memory of a pixel under a light, and of a pixel with the texels under it.
 VALUE_BYTES, FOOTPRINT_BYTES = 15, 100
 

@@ -23,7 +23,13 @@ from reflfield.observations.texel_reading import TexelReader
 from reflfield.pipeline.cache import RESTARTABLE
 from reflfield.pipeline.clipped_values import MEASURED, stored_measured
 from reflfield.pipeline.context import Context
-from reflfield.pipeline.silhouette_store import SILHOUETTES, StoredSilhouettes
+from reflfield.pipeline.view_store import (
+    EDGES,
+    SILHOUETTES,
+    StoredSilhouettes,
+    stored_view,
+    unpacked_mask,
+)
 from reflfield.util.files import load_arrays
 
 T = TypeVar("T")
@@ -134,6 +140,12 @@ def view_visible(context: Context) -> Bools:
 def light_visible(context: Context) -> Bools:
     """(n_texels, n_lights) True where the light reaches the texel."""
     return arrays(context, "visibility", "visibility.npz")["lights"]
+
+
+def depth_edges(context: Context, view: int) -> Bools:
+    """(height, width) True at the pixels of a training view beside a depth discontinuity."""
+    path, camera = file(context, "visibility", EDGES), context.training.cameras[view]
+    return unpacked_mask(stored_view(path, view, camera), camera)
 
 
 def texels_in_view(context: Context) -> Indices:

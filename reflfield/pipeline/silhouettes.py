@@ -10,7 +10,7 @@ import numpy as np
 from reflfield.capture.capture import Capture
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import silhouettes_at_once
-from reflfield.pipeline.silhouette_store import SILHOUETTES, store_silhouettes
+from reflfield.pipeline.view_store import SILHOUETTES, name_of, store_views
 
 # Views of one block, and pixels of their silhouettes.
 VIEWS_AT_ONCE = 8
@@ -28,7 +28,7 @@ def write_silhouettes(context: Context, folder: Path) -> dict[str, Any]:
         at_once=silhouettes_at_once(context),
     )
     views = (named for arrays in blocks for named in arrays.items())
-    store_silhouettes(folder / SILHOUETTES, views)
+    store_views(folder / SILHOUETTES, views)
     n_given = sum(path is not None for path in capture.silhouettes)
     return {"views": capture.n_views, "silhouettes given": n_given}
 
@@ -36,7 +36,7 @@ def write_silhouettes(context: Context, folder: Path) -> dict[str, Any]:
 def silhouettes_block(capture: Capture, views: range) -> dict[str, Any]:
     """Coverage of some views, 8 bits."""
     return {
-        f"view{i}": np.rint(capture.read_silhouette(i) * 255).astype(np.uint8) for i in views
+        name_of(i): np.rint(capture.read_silhouette(i) * 255).astype(np.uint8) for i in views
     }
 
 

@@ -13,16 +13,28 @@ from numpy.typing import NDArray
 from reflfield.capture.capture import Capture
 from reflfield.errors import InputError
 from reflfield.geometry.mesh import Mesh
-from reflfield.geometry.occlusion import VisibilityOptions, light_visibility, view_visibility
+from reflfield.geometry.occlusion import (
+    VisibilityOptions,
+    depth_edges,
+    light_visibility,
+    view_visibility,
+)
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import TexelTable
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import readers_at_once
+from reflfield.pipeline.view_store import (
+    EDGES,
+    name_of,
+    packed_mask,
+    store_views,
+    unpacked_mask,
+)
 from reflfield.util.dask_cluster import threads_here
 
-# Views, or lights, of one block.
-DIRECTIONS_AT_ONCE = 8
+# Views, or lights, of one block; what a block calls the texels that they see.
+DIRECTIONS_AT_ONCE, SEEN = 8, "seen"
 
 
 def write_visibility(context: Context, folder: Path) -> dict[str, Any]:
@@ -43,7 +55,7 @@ def write_visibility(context: Context, folder: Path) -> dict[str, Any]:
     parts = context.blocks(folder).map(
         "visibility", visibility_block, shared, named, at_once=at_once
     )
-    columns = [arrays["seen"] for arrays in parts]
+    columns = [arrays[SEEN] for arrays in parts]
     views = np.concatenate(columns[: len(view_runs)], axis=1)
     lights = np.concatenate(columns[len(view_runs) :], axis=1)
     if not views.any():
@@ -52,6 +64,8 @@ def write_visibility(context: Context, folder: Path) -> dict[str, Any]:
             "calibration against the silhouettes"
         )
     np.savez_compressed(folder / "visibility.npz", views=views, lights=lights)
+    named_edges = (named for part in parts for named in part.items() if named[0] != SEEN)
+    store_views(folder / EDGES, named_edges)
     return {
         "texels": len(texels),
         "texels that no camera sees": int((~views.any(axis=1)).sum()),
@@ -86,33 +100,34 @@ class VisibilityRays:
     def silhouette(self, view: int) -> NDArray[np.bool_] | None:
         """Pixels (h, w) of a view that the object covers."""
         bits, camera = self.covered[view], self.capture.cameras[view]
-        if bits is None:
-            return None
-        pixels = np.unpackbits(bits, count=camera.width * camera.height)
-        return pixels.reshape(camera.height, camera.width).astype(np.bool_)
+        return None if bits is None else unpacked_mask(bits, camera)
 
 
 def visibility_block(shared: VisibilityRays, block: tuple[str, range]) -> dict[str, Any]:
-    """Which texels some views or lights see, (n_texels, k)."""
+    """Which texels some views or lights see, (n_texels, k); depth edges of the views."""
     kind, some = block
     scene = RayScene(shared.mesh, threads=threads_here(shared.threads))
     capture, texels, options = shared.capture, shared.texels, shared.options
-    if kind == "views":
-        columns = [
-            view_visibility(
-                texels, scene, capture.cameras[i], options, silhouette=shared.silhouette(i)
-            )
-            for i in some
-        ]
-    else:
+    if kind == "lights":
         columns = [light_visibility(texels, scene, capture.lights[i], options) for i in some]
-    return {"seen": np.stack(columns, axis=1)}
+        return {SEEN: np.stack(columns, axis=1)}
+    columns, edges = [], {}
+    for i in some:
+        camera, silhouette = capture.cameras[i], shared.silhouette(i)
+        of_view = depth_edges(scene, camera, options)
+        columns.append(
+            view_visibility(
+                texels, scene, camera, options, edges=of_view, silhouette=silhouette
+            )
+        )
+        edges[name_of(i)] = packed_mask(of_view)
+    return {SEEN: np.stack(columns, axis=1), **edges}
 
 
 def covered_pixels(context: Context) -> list[NDArray[np.uint8]]:
     """Pixels of each view that count as covered by the object, eight in a byte."""
     least = context.options.visibility.coverage
-    return [np.packbits(silhouette >= least) for silhouette in results.silhouettes(context)]
+    return [packed_mask(silhouette >= least) for silhouette in results.silhouettes(context)]
 
 
 def runs(n: int) -> list[range]:

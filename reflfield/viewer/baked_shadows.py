@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from reflfield.field.indirect_fit import fit_indirect
+from reflfield.field.indirect_fit import fit_to_shade
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.field.observed_sphere import fibonacci_directions
 from reflfield.field.reflectance_field import ReflectanceField
@@ -14,9 +14,8 @@ from reflfield.render.bounced_light import BouncedLight
 from reflfield.render.camera_rays import FieldSurface
 
 # Directions of light that the harmonics are fitted to where the capture states none, and at
-# most; functions beside their mean; texels that shape them, and that are solved together.
-MOST_LIGHTS, N_COMPONENTS = 64, 8
-TRAINING_TEXELS, TEXELS_AT_ONCE = 4096, 1024
+# most; functions beside their mean; texels that shape them.
+MOST_LIGHTS, N_COMPONENTS, TRAINING_TEXELS = 64, 8, 4096
 
 
 def baked_indirect(field: ReflectanceField, workers: int = 1) -> IndirectLight:
@@ -37,16 +36,16 @@ def baked_indirect(field: ReflectanceField, workers: int = 1) -> IndirectLight:
         return field.indirect
     shade = _shown_in_shadows(field, workers)
     rows = np.flatnonzero(shade.weights.any(axis=(1, 2)))
-    rng = np.random.default_rng(0)
-    some = np.sort(rng.choice(rows, min(len(rows), TRAINING_TEXELS), replace=False))
 
     def read(texels: NDArray[np.intp]) -> Shade:
         return Shade(*(a[texels] for a in (shade.values, shade.weights, shade.lights)))
 
-    model = fit_indirect(read, some, shade.lights.shape[1], N_COMPONENTS)
-    coefficients = np.zeros((field.n_texels, len(model.variances)), np.float32)
-    for part in np.array_split(rows, max(1, len(rows) // TEXELS_AT_ONCE)):
-        coefficients[part] = model.coefficients(read(part))
+    n_lights = shade.lights.shape[1]
+    model, of_rows = fit_to_shade(
+        read, rows, n_lights, N_COMPONENTS, most=TRAINING_TEXELS, workers=workers
+    )
+    coefficients = np.zeros((field.n_texels, of_rows.shape[1]), np.float32)
+    coefficients[rows] = of_rows
     return IndirectLight(model.functions(), coefficients, field.observed_lights)
 
 

@@ -1,5 +1,6 @@
 """Indirect light: planted functions come back from scattered shade, at any scale."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from reflfield.field.indirect_fit import (
     Systems,
     band_limit_for,
     fit_indirect,
+    fit_to_shade,
 )
 from reflfield.field.indirect_light import IndirectLight, no_indirect_light
 from reflfield.field.observed_sphere import covered
@@ -20,6 +22,7 @@ from reflfield.sphere.harmonics import real_harmonics
 from tests.synthetic_fields import square_surface
 
 N_LIGHTS, N_COMPONENTS = 30, 3
+ONE_THREAD = ThreadPoolExecutor(1)
 
 
 def directions(rng, n):
@@ -57,7 +60,8 @@ def some(shade, texels):
 
 def fitted(shade, n_components=N_COMPONENTS, n_lights=N_LIGHTS):
     model = fit_indirect(
-        lambda texels: some(shade, texels), np.arange(len(shade.values)), n_lights, n_components
+        lambda texels: some(shade, texels),
+        *(np.arange(len(shade.values)), n_lights, n_components, ONE_THREAD),
     )
     return model, IndirectLight(model.functions(), model.coefficients(shade))
 
@@ -119,12 +123,39 @@ def test_no_shade_no_energy_and_one_texel_are_defined(rng):
     assert np.abs(residual).max() < 0.2 * np.abs(one.values).max()
 
 
+def test_threads_change_nothing(rng):
+    """Of more texels than are solved together."""
+    _, shade = planted(rng, n_texels=3000)
+    texels = np.arange(3000)
+    one, four = (
+        fit_to_shade(
+            lambda t: some(shade, t), texels, N_LIGHTS, N_COMPONENTS, most=2500, workers=n
+        )
+        for n in (1, 4)
+    )
+    assert np.array_equal(one[0].functions(), four[0].functions())
+    assert np.array_equal(one[1], four[1])
+
+
+def test_coefficients_stay_in_the_order_of_the_texels(rng):
+    """Parts come back from threads; each texel has what it would have alone."""
+    _, shade = planted(rng, n_texels=3000)
+    texels = rng.permutation(3000)[:2100]
+    model, coefficients = fit_to_shade(
+        lambda t: some(shade, t), texels, N_LIGHTS, N_COMPONENTS, most=500, workers=2
+    )
+    for place in (0, 1023, 1024, 2099):
+        alone = model.coefficients(some(shade, texels[[place]]))
+        assert np.allclose(coefficients[place], alone[0], atol=1e-5)  # as BLAS orders its sums
+
+
 @pytest.mark.stability
 def test_object_without_a_texel_in_shadow_has_black_indirect_light(rng):
     """As under a flash beside the camera: what it does not reach is not seen either."""
     _, shade = planted(rng, n_texels=4)
     model = fit_indirect(
-        lambda texels: some(shade, texels), np.zeros(0, np.intp), N_LIGHTS, N_COMPONENTS
+        lambda texels: some(shade, texels),
+        *(np.zeros(0, np.intp), N_LIGHTS, N_COMPONENTS, ONE_THREAD),
     )
     light = IndirectLight(model.functions(), model.coefficients(some(shade, np.arange(0))))
     assert light.is_black
@@ -236,7 +267,9 @@ def test_no_texel_is_made_brighter_than_it_was_seen(monkeypatch, rng):
     shade = Shade(noisy.astype(np.float32), weights, lights)
 
     def brightest():
-        model = fit_indirect(lambda some_: some(shade, some_), np.arange(200), len(DOME), 2)
+        model = fit_indirect(
+            lambda some_: some(shade, some_), np.arange(200), len(DOME), 2, ONE_THREAD
+        )
         light = IndirectLight(model.functions(), model.coefficients(shade), DOME)
         return light.under(np.arange(100, 150), DOME, 1).max()
 
