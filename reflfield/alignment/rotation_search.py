@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypedDict, TypeVar
 
@@ -23,7 +22,7 @@ from reflfield.alignment.correlation import degree_arrays, degrees_of, spectrum
 from reflfield.alignment.newton_ascent import follow, lowest_z_of
 from reflfield.errors import InputError
 from reflfield.sphere.coupling import Coupled
-from reflfield.util.blas_threads import one_core_blas
+from reflfield.util.blas_threads import one_core_blas, thread_pool
 from reflfield.util.validation import check_shape
 
 # Functions handled together: their series and coarse values stay within a few MB.
@@ -182,7 +181,7 @@ def map_blocks(
     with one_core_blas():
         if n_threads == 1 or len(blocks) == 1:
             return [work(block) for block in blocks]
-        with ThreadPoolExecutor(n_threads) as pool:
+        with thread_pool(n_threads) as pool:
             return list(pool.map(work, blocks))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from reflfield.errors import CaptureError, GeometryError, InputError
 from reflfield.geometry.cones import View
 from reflfield.geometry.silhouette_distance import signed_distance
 from reflfield.options import available_cores
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 Float32 = NDArray[np.float32]
@@ -68,7 +68,7 @@ def checked_views(
         for number in range(capture.n_views)
         if capture.silhouettes[number] is not None or number in photographs.means
     ]
-    with ThreadPoolExecutor(available_cores()) as pool:
+    with thread_pool(available_cores()) as pool:
         views = pool.map(lambda number: _checked_view(capture, number, photographs), numbers)
         yield from track(views, len(numbers), "silhouettes")
 

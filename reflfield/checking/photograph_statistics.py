@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +16,7 @@ from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.image_files import read_small_kinds
 from reflfield.errors import InputError
 from reflfield.options import available_cores
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 Float32 = NDArray[np.float32]
@@ -138,7 +138,7 @@ def _outcomes(
 ) -> Iterator[tuple[int, tuple[PhotographStatistics, Float32] | str]]:
     """What each photograph says, some ahead of who asks; why not, of one that is damaged."""
     n_threads = available_cores()
-    with ThreadPoolExecutor(n_threads) as pool:
+    with thread_pool(n_threads) as pool:
         for first in range(0, len(chosen), 4 * n_threads):
             some = chosen[first : first + 4 * n_threads]
             yield from zip(some, pool.map(lambda i: _read(capture, i), some), strict=True)

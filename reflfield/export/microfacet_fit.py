@@ -12,7 +12,6 @@ start at the best of several widths of a round highlight.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +24,7 @@ from reflfield.export.microfacets import DIELECTRIC_F0, gloss_term
 from reflfield.field.evaluation import evaluate
 from reflfield.field.reflectance_field import ClusteredField, ReflectanceField
 from reflfield.options import available_cores
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.cholesky import cholesky_factor
 from reflfield.util.progress import track
 
@@ -189,7 +189,7 @@ def fit_microfacets(
         _fit_texels(views @ to_local, lights @ to_local, exposure * samples, unknowns)
         return unknowns
 
-    with ThreadPoolExecutor(available_cores()) as pool:
+    with thread_pool(available_cores()) as pool:
         done = track(pool.map(one, blocks), len(blocks), "fit of the maps")
         unknowns = np.concatenate(list(done))
     return _in_world(unknowns, field.local_from_world.astype(np.float64))

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from reflfield.errors import InputError
 from reflfield.observations.shade import Shade
 from reflfield.sphere.harmonics import n_coefficients, real_harmonics
-from reflfield.util.blas_threads import one_core_blas
+from reflfield.util.blas_threads import thread_pool
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -217,7 +217,7 @@ def fit_to_shade(
     rng = np.random.default_rng(seed)
     training = np.sort(rng.choice(texels, min(len(texels), most), replace=False))
     blocks = np.array_split(texels, max(1, len(texels) // TEXELS_AT_ONCE))
-    with one_core_blas(), ThreadPoolExecutor(max(workers, 1)) as pool:
+    with thread_pool(workers) as pool:
         model = fit_indirect(read, training, n_lights, n_components, pool)
         coefficients = list(pool.map(lambda block: model.coefficients(read(block)), blocks))
     return model, np.concatenate(coefficients)

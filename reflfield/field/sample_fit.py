@@ -26,6 +26,7 @@ from reflfield.field.basis import BasisProblem
 from reflfield.field.clustered_model import ClusteredModel, normalised
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.observations.texel_samples import TransformedSamples
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import report
 from reflfield.util.validation import check_ranges
 
@@ -132,7 +133,7 @@ def fit_basis(
     n_chosen = int(np.clip(options.max_bytes // bytes_per_texel, 256, len(observed)))
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.choice(observed, min(n_chosen, len(observed)), replace=False))
-    with ThreadPoolExecutor(workers) as pool:
+    with thread_pool(workers) as pool:
         return _alternate(read(chosen), initial, chosen, options, pool)
 
 

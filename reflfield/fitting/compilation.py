@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
 from reflfield.field.half_vector_evaluation import evaluate_half_vector
@@ -20,6 +18,7 @@ from reflfield.fitting.texel_sample_fit import (
     start_model,
     with_start_colors,
 )
+from reflfield.util.blas_threads import thread_pool
 
 
 def compile_kernels() -> None:
@@ -48,7 +47,7 @@ def compile_kernels() -> None:
     )
     graph = TexelGraph(2, np.array([[0, 1]]))
     blocks = SampleBlocks(lambda number: block, 1, 1 << 20)
-    with ThreadPoolExecutor(1) as pool:
+    with thread_pool(1) as pool:
         model = with_start_colors(blocks, start_model(frames, 1), pool)
         model, _ = fit_to_samples(blocks, model, pool, 1, 1e-3)
         model = with_tangents_along_highlights(blocks, model, graph, pool)

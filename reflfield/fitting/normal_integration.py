@@ -21,7 +21,6 @@ SIGGRAPH 2005.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +33,7 @@ from reflfield.capture.cameras import Camera
 from reflfield.errors import GeometryError
 from reflfield.fitting.texel_graph import TexelGraph
 from reflfield.geometry.silhouette_distance import SignedDistance
+from reflfield.util.blas_threads import thread_pool
 
 Array = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ def silhouette_anchors(
         )
 
     anchors = np.zeros(len(positions))
-    with ThreadPoolExecutor(max(workers, 1)) as pool:
+    with thread_pool(workers) as pool:
         for near, sure in pool.map(of_view, range(len(cameras))):
             anchors[near] = np.maximum(anchors[near], sure)
     return anchors

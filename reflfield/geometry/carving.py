@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reflfield.errors import GeometryError
 from reflfield.geometry.cones import View
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.even_order import even_order
 
 Array = NDArray[np.float64]
@@ -144,7 +145,7 @@ def smallest_distance(
     Points found below ``-cutoff`` are not followed further: their value is some number
     below ``-cutoff``.
     """
-    with ThreadPoolExecutor(max(workers, 1)) as pool:
+    with thread_pool(workers) as pool:
         if tolerance <= _MOST_SORTED:
             return _sorted_distance(views, points, tolerance, cutoff, pool)
 

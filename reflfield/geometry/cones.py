@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from reflfield.capture.cameras import Camera
 from reflfield.errors import InputError
 from reflfield.geometry.silhouette_distance import SignedDistance, signed_distance
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def measured_views(
         return View(camera, outline)
 
     n = len(cameras)
-    with ThreadPoolExecutor(max(workers, 1)) as pool:
+    with thread_pool(workers) as pool:
         return list(track(pool.map(measured, range(n)), n, "silhouettes"))
 
 

@@ -14,7 +14,6 @@ points apart. Metals have none that is much lower than elsewhere, and stay where
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ from scipy.ndimage import generic_filter, median_filter
 from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.geometry.light_stack import ReducedView, pixel_centres, projection_matrix
 from reflfield.geometry.ray_scene import RayScene
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 Array = NDArray[np.float64]
@@ -133,7 +133,7 @@ def search_depths(
     def one(index: int) -> ViewDepths:
         return _depths_of(views[index], packed, scene, _others(towards, index), every)
 
-    with ThreadPoolExecutor(n_threads) as pool:
+    with thread_pool(n_threads) as pool:
         return list(track(pool.map(one, range(len(views))), len(views), "depths by light"))
 
 

@@ -23,7 +23,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,6 +40,7 @@ from reflfield.geometry.patch_costs import (
     patch_costs,
 )
 from reflfield.geometry.ray_scene import RayScene
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 Array = NDArray[np.float64]
@@ -146,7 +146,7 @@ class PatchStereo:
             others = neighbours(towards, index)
             return _seen_surface(self.views[index], images, (self.hull, surface), others)
 
-        with ThreadPoolExecutor(self.n_threads) as pool:
+        with thread_pool(self.n_threads) as pool:
             seen = list(track(pool.map(one, self.chosen), len(self.chosen), words))
         among = towards[list(self.chosen)]
         return [_confirmed(seen, i, neighbours(among, i)) for i in range(len(seen))]
@@ -166,7 +166,7 @@ class PatchStereo:
             own = OwnImage(view.grey - _mean(view), view.covered & known)
             return depth, patch_costs(images, on, own, others)[..., 0]
 
-        with ThreadPoolExecutor(self.n_threads) as pool:
+        with thread_pool(self.n_threads) as pool:
             return list(pool.map(one, self.chosen))
 
     def _images(self) -> PackedImages:

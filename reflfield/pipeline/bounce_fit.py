@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from reflfield.pipeline.context import Context
 from reflfield.pipeline.indirect import fitted_to_shade
 from reflfield.render.bounced_light import BouncedLight
 from reflfield.render.camera_rays import FieldSurface
+from reflfield.util.blas_threads import thread_pool
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -95,7 +95,7 @@ def _of_shade(
         row, place = np.nonzero(shade.light == number)
         return row, place, traced.under(lights[number], lit[:, number])[shade.texels[row]]
 
-    with ThreadPoolExecutor(traced.workers) as pool:
+    with thread_pool(traced.workers) as pool:
         for row, place, values in pool.map(under, numbers.tolist()):
             bounced[row, place] = values
     return bounced

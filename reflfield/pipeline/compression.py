@@ -24,6 +24,7 @@ from reflfield.pipeline.model_fitting import fitted_model
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.pipeline.resampling import ALL_COEFFICIENTS, Resampled
 from reflfield.pipeline.saturated_highlights import saturation_counts
+from reflfield.util.blas_threads import one_core_blas
 
 Floats = NDArray[np.float32]
 
@@ -31,7 +32,9 @@ Floats = NDArray[np.float32]
 def write_compression(context: Context, folder: Path) -> dict[str, Any]:
     """Fit the model that the options name -> field, and see what it makes of highlights."""
     if context.options.compression.model == HALF_VECTOR:
-        counts = write_half_vector_field(context, folder)
+        # Its products are of lists of points.
+        with one_core_blas():
+            counts = write_half_vector_field(context, folder)
     else:
         counts = write_clustered_field(context, folder)
     told = saturation_counts(context.refined, open_field(folder / "field.rfld"))

@@ -62,6 +62,7 @@ from reflfield.pipeline.memory import readers_at_once, working_bytes
 from reflfield.pipeline.pixel_shares import Shares, shares_within, some_of, spread_over
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import report
 
 Floats = NDArray[np.float32]
@@ -158,7 +159,7 @@ class HalfVectorFit:
         context = self.context
         some = self.blocks(results.random_texels(context, LOBE_TEXELS))
         frames = results.texels(context).local_from_world
-        with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
+        with thread_pool(context.resources.workers) as pool:
             errors, nearest = left_out_errors(
                 *(some, frames, views_left_out(context.training.n_views), pool),
                 *(self.options.smoothness, context.options.seed),
@@ -176,7 +177,7 @@ class HalfVectorFit:
     def to_samples(self, n_lobes: int) -> HalfVectorModel:
         """Model in units of white, fitted to the samples of the texels."""
         context = self.context
-        with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
+        with thread_pool(context.resources.workers) as pool:
             blocks = self.blocks(results.measured_texels(context))
             model = start_model(results.texels(context).local_from_world, n_lobes)
             model = with_start_colors(blocks, model, pool)
@@ -202,7 +203,7 @@ class HalfVectorFit:
         fit = ImageFit(model, np.zeros(model.n_texels), 0.0)
         if not self.options.image_steps:
             return fit
-        with ThreadPoolExecutor(max(context.resources.workers, 1)) as pool:
+        with thread_pool(context.resources.workers) as pool:
             views = self.pixels(model, pool)
             rows = pixel_rows(views, PIXEL_ROWS, context.options.seed)
             allocate = self.allocator(views, model.n_lobes, folder)

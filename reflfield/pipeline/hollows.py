@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from reflfield.geometry.specks import without_specks
 from reflfield.geometry.stereo_carving import MOST_VIEWS, carved_by_stereo
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 # Lights that are compared, and those that a glance needs; spread evenly over the list.
@@ -153,7 +153,7 @@ def _patch_views(context: Context, views: NDArray[np.intp]) -> list[PatchView]:
         some = some[np.unique(np.linspace(0, len(some) - 1, MOST_PHOTOGRAPHS).astype(int))]
         return PatchView.of(_reduced(context, int(view), index[some], factor))
 
-    with ThreadPoolExecutor(context.resources.workers) as pool:
+    with thread_pool(context.resources.workers) as pool:
         return list(track(pool.map(one, views), len(views), "views reduced"))
 
 
@@ -168,7 +168,7 @@ def _stacked(context: Context, views: NDArray[np.intp], most: int) -> list[Reduc
     def one(number: int) -> ReducedView:
         return _reduced(context, int(views[number]), index[number, lights], factor)
 
-    with ThreadPoolExecutor(context.resources.workers) as pool:
+    with thread_pool(context.resources.workers) as pool:
         return list(track(pool.map(one, range(len(views))), len(views), "views reduced"))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
@@ -42,6 +41,7 @@ from reflfield.pipeline.one_view_fit import (
 )
 from reflfield.pipeline.quantisation_search import FieldMaker
 from reflfield.pipeline.resampling import Resampled, fits_in_one_pass
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.blocks import BlockFunction, Blocks
 
 Floats = NDArray[np.float32]
@@ -312,7 +312,7 @@ def coefficients_block(
 ) -> dict[str, Floats]:
     """Return coefficients of some texels in the basis of the model."""
     reader, model = shared
-    with ThreadPoolExecutor(1) as pool:
+    with thread_pool(1) as pool:
         coefficients, _ = solve_coefficients(
             reader.transformed(texels), model.cluster[texels], model, pool, bounded=True
         )
@@ -327,7 +327,7 @@ def _noise(context: Context, model: ClusteredModel, reader: TexelReader) -> NDAr
     count = min(len(measured), TEXELS_FOR_NOISE, most)
     some = np.sort(np.random.default_rng(options.seed).choice(measured, count, replace=False))
     usual = normalised(model, model.residuals[-1] ** 2, measured)
-    with ThreadPoolExecutor(1) as pool:
+    with thread_pool(1) as pool:
         _, squares = solve_coefficients(
             reader.transformed(some), usual.cluster[some], usual, pool
         )
@@ -343,7 +343,7 @@ def bounded_block(
     cluster, coefficients = model.cluster[texels], model.coefficients[texels]
     beyond = beyond_bounds(samples, cluster, coefficients, probes(model.table))
     if beyond.any():
-        with ThreadPoolExecutor(1) as pool:
+        with thread_pool(1) as pool:
             bounded, _ = solve_coefficients(
                 samples, cluster, model, pool, bounded=True, deviation=GRID_DEVIATION
             )

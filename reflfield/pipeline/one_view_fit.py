@@ -9,7 +9,6 @@ texel does not depend on their number.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +20,7 @@ from reflfield.field.clustered_model import ClusteredModel
 from reflfield.field.coefficients import solve_coefficients
 from reflfield.observations.texel_reading import TexelReader
 from reflfield.observations.texel_samples import TransformedSamples
+from reflfield.util.blas_threads import thread_pool
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -58,7 +58,7 @@ def completed_block(
 
 def _completed(samples: TransformedSamples, completion: ClusteredModel) -> Floats:
     cluster = np.zeros(len(samples.values), np.int32)
-    with ThreadPoolExecutor(1) as pool:
+    with thread_pool(1) as pool:
         return solve_coefficients(samples, cluster, completion, pool)[0]
 
 
@@ -66,7 +66,7 @@ def texels_block(fit: OneViewFit, texels: Indices) -> dict[str, NDArray[Any]]:
     """Cluster and coefficients of some texels."""
     samples = fit.reader.transformed(texels)
     cluster = nearest(_completed(samples, fit.completion), fit.clusters)[0]
-    with ThreadPoolExecutor(1) as pool:
+    with thread_pool(1) as pool:
         coefficients, _ = solve_coefficients(samples, cluster, fit.model, pool, bounded=True)
     return {"cluster": cluster, "coefficients": coefficients}
 

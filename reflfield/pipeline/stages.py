@@ -200,6 +200,7 @@ COMPLETION = Stage(
     after=(OBSERVATIONS,),
     options=lambda options: (options.completion, options.resampling, options.seed),
     wanted=lambda context: context.options.aligns and not context.photometric,
+    large_products=True,
 )
 # one local frame per texel
 ALIGNMENT = Stage(
@@ -208,6 +209,7 @@ ALIGNMENT = Stage(
     after=(OBSERVATIONS, COMPLETION),
     options=lambda options: (options.alignment, options.resampling, options.seed),
     wanted=lambda context: context.options.aligns,
+    large_products=True,
 )
 # raw samples again, in the aligned frames, on the grid; missing samples filled
 RESAMPLING = Stage(
@@ -222,6 +224,7 @@ RESAMPLING = Stage(
     ),
     reads=resampling.texels_read,
     wanted=lambda context: context.options.aligns,
+    large_products=True,
 )
 # model fitted to the raw samples, and to the photographs -> field file
 COMPRESSION = Stage(
@@ -233,6 +236,7 @@ COMPRESSION = Stage(
     ),
     options=stage_inputs.field_options,
     reads=stage_inputs.field_metadata_digest,
+    large_products=True,
 )
 # the field's frames as images, the mesh with its mean texture
 MAPS = Stage("maps", maps.write_maps, after=(COMPRESSION,))
@@ -244,6 +248,7 @@ WITHOUT_ALIGNMENT = Stage(
     options=stage_inputs.field_options,
     reads=stage_inputs.field_metadata_digest,
     wanted=lambda context: context.options.compares_without_alignment,
+    large_products=True,
 )
 # held-out photographs against the fields relit from their cameras
 COMPARISON = Stage(

@@ -22,7 +22,6 @@ diffuse surfaces", SIGGRAPH 1984.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 from reflfield.capture.lights import Light
 from reflfield.field.evaluation import evaluate, texel_taps
 from reflfield.render.camera_rays import FieldSurface
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.late_import import LateImport
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class BouncedLight:
             np.arange(first, min(first + TEXELS_AT_ONCE, n))
             for first in range(0, n, TEXELS_AT_ONCE)
         ]
-        with ThreadPoolExecutor(self.workers) as pool:
+        with thread_pool(self.workers) as pool:
             parts = list(pool.map(self._traced, blocks))
         rows, columns = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         share = np.full(len(rows), 1.0 / RAYS_ALONG**2, np.float32)

@@ -12,7 +12,6 @@ their texels, with what lit parts of the surface send there (`render.bounced_lig
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import isqrt
 
@@ -35,6 +34,7 @@ from reflfield.render.camera_rays import (
 )
 from reflfield.render.distant_lights import DistantLights
 from reflfield.render.environment_map import EnvironmentMap
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.validation import check_ranges
 
 Array = NDArray[np.float64]
@@ -234,7 +234,7 @@ class Renderer:
         images = np.zeros((len(groups), camera.height, camera.width, 3), np.float32)
         coverage = np.zeros((camera.height, camera.width), np.float32)
         blocks = _blocks(pixel_window(camera, self.surface.mesh), self.options.block_pixels)
-        with ThreadPoolExecutor(self.options.n_threads) as pool:
+        with thread_pool(self.options.n_threads) as pool:
             done = pool.map(lambda block: self._block(camera, groups, *block), blocks)
             for (row, column), (radiance, covered) in zip(blocks, done, strict=True):
                 images[:, row, column] = radiance
@@ -252,7 +252,7 @@ class Renderer:
             del self._bounces[key]
         bounced = self._bounced
         _ = (bounced.shares, bounced.albedo)
-        with ThreadPoolExecutor(self.options.n_threads) as pool:
+        with thread_pool(self.options.n_threads) as pool:
             for light, values in zip(
                 new.values(), pool.map(bounced.under, new.values()), strict=True
             ):
@@ -420,7 +420,7 @@ class EnvironmentLighting:
             powers = self._lights.irradiances[part]
             return np.einsum("nmc,mc,nm->nc", shown, powers, ~lit, optimize=True)
 
-        with ThreadPoolExecutor(workers) as pool:
+        with thread_pool(workers) as pool:
             list(pool.map(self._lit, np.array_split(texels, max(1, 4 * workers))))
             parts = pool.map(under, range(0, len(directions), _BOUNCES_AT_ONCE))
             return np.asarray(sum(parts, start=np.zeros((len(texels), 3))))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 import threading
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -42,6 +44,13 @@ _ONE_CORE = _OneCore()
 def one_core_blas() -> AbstractContextManager[None]:
     """Keep the BLAS from threads of its own: the blocks have theirs, and two layers fight."""
     return _ONE_CORE
+
+
+@contextmanager
+def thread_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads, at least one, for parts of some work; the BLAS has one in each of them."""
+    with one_core_blas(), ThreadPoolExecutor(max(workers, 1)) as pool:
+        yield pool
 
 
 @lru_cache(maxsize=1)
