@@ -66,6 +66,9 @@ def with_bounced_light(
         return indirect
     bounced = _of_shade(context, traced, shade, lights) ** np.float32(1 / power)
     gain = _gain(shade, bounced, lights)
+    # Of few lights it may have come out larger.
+    if (gain < LEAST_GAIN).all():
+        return indirect
 
     def read(rows: Indices) -> Shade:
         of_harmonics = shade.rows(rows)
