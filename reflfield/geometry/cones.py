@@ -33,13 +33,17 @@ class View:
         """Signed distance (n,) to the silhouette's cone, and width of a pixel there, metres."""
         pixels, depth = self.camera.project(points)
         perspective = self.camera.kind != "orthographic"
-        imaged = np.isfinite(pixels).all(axis=1) & ((depth > 0.0) | (not perspective))
+        imaged = np.isfinite(pixels[:, 0]) & np.isfinite(pixels[:, 1])
+        if perspective:
+            imaged &= depth > 0.0
         # What a camera cannot image is empty, unless it does not see the whole object.
         distance = np.full(len(points), np.inf if self.outline.leaves_image else -np.inf)
         focal = 0.5 * (self.camera.fl_x + self.camera.fl_y)
         metres = (
             np.maximum(depth, 0.0) / focal if perspective else np.full_like(depth, 1 / focal)
         )
+        if imaged.all():
+            return self.outline.at(pixels) * metres, metres
         distance[imaged] = self.outline.at(pixels[imaged]) * metres[imaged]
         return distance, metres
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.geometry.cones import View
+from reflfield.util.blas_threads import thread_pool
 
 Array = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -172,11 +173,12 @@ def set_aside(
     return Verdict(tuple(sorted(outliers)), agree, first.uncovered, excluded)
 
 
-def votes_of(views: Sequence[View], low: Array, high: Array) -> Votes:
+def votes_of(views: Sequence[View], low: Array, high: Array, workers: int = 1) -> Votes:
     """Which views exclude which voxels of a box.
 
     A voxel is excluded if it lies farther outside of a cone than its size and half a pixel, so
-    that neither the grid nor noisy outlines exclude anything.
+    that neither the grid nor noisy outlines exclude anything. The votes do not depend on the
+    number of threads.
     """
     longest = float((high - low).max())
     filled = float(np.prod((high - low) / longest))
@@ -190,10 +192,17 @@ def votes_of(views: Sequence[View], low: Array, high: Array) -> Votes:
     centres = low + spacing * (np.indices(shape).reshape(3, -1).T + 0.5)
     excluded = np.zeros((len(views), len(centres)), dtype=bool)
     nearest = np.full(len(centres), np.inf, dtype=np.float32)
-    for number, view in enumerate(views):
-        distance, pixel = view.distance_and_pixel(centres)
+
+    def vote(number: int) -> Array:
+        distance, pixel = views[number].distance_and_pixel(centres)
         excluded[number] = distance < -(spacing + _NOISE_PX * pixel)
-        np.minimum(nearest, distance, out=nearest)
+        return distance
+
+    with thread_pool(workers) as pool:
+        for first in range(0, len(views), 2 * max(workers, 1)):
+            some = range(first, min(first + 2 * max(workers, 1), len(views)))
+            for distance in pool.map(vote, some):
+                np.minimum(nearest, distance, out=nearest)
     return Votes(low, spacing, shape, excluded, nearest)
 
 

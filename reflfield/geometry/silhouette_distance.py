@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 from reflfield.errors import GeometryError, InputError
@@ -72,20 +73,39 @@ class SignedDistance:
 
         Outside the frame the answer continues with slope 1: downwards (empty) if the
         object is in the frame as a whole, upwards (unknown, so nothing is carved) if not.
+        NaN where a coordinate is.
         """
-        values = self.values
-        height, width = values.shape
-        limit = np.array([width, height], dtype=np.float64)
-        nearest = np.clip(pixels, 0.0, limit)
-        beyond = np.hypot(*(pixels - nearest).T)
-        inside = ndimage.map_coordinates(
-            values, (nearest - 0.5).T[::-1], order=1, mode="nearest", output=np.float64
-        )
-        if not self.leaves_image:
-            return inside - beyond
-        # Continuous across the border: emptiness fades to "unknown" within the frame.
-        to_border = np.minimum(nearest, limit - nearest).min(axis=1)
-        return np.where(beyond > 0.0, beyond, np.maximum(inside, -to_border))
+        out = np.full(len(pixels), np.nan)
+        _look_up(np.asarray(self.values), pixels, self.leaves_image, out)
+        return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_up(values: Any, pixels: Any, leaves_image: bool, out: Any) -> None:
+    """`SignedDistance.at`: bilinear between the centres of pixels; `out` is NaN before."""
+    height, width = values.shape
+    for n in range(len(pixels)):
+        x, y = pixels[n, 0], pixels[n, 1]
+        if np.isnan(x) or np.isnan(y):
+            continue
+        in_x, in_y = min(max(x, 0.0), float(width)), min(max(y, 0.0), float(height))
+        beyond = np.hypot(x - in_x, y - in_y)
+        column = min(max(in_x - 0.5, 0.0), width - 1.0)
+        row = min(max(in_y - 0.5, 0.0), height - 1.0)
+        c, r = min(int(column), max(width - 2, 0)), min(int(row), max(height - 2, 0))
+        c_next, r_next = min(c + 1, width - 1), min(r + 1, height - 1)
+        fx, fy = column - c, row - r
+        upper = (1.0 - fx) * values[r, c] + fx * values[r, c_next]
+        lower = (1.0 - fx) * values[r_next, c] + fx * values[r_next, c_next]
+        inside = (1.0 - fy) * upper + fy * lower
+        if not leaves_image:
+            out[n] = inside - beyond
+        elif beyond > 0.0:
+            out[n] = beyond
+        else:
+            # Continuous across the border: emptiness fades to "unknown" within the frame.
+            to_border = min(in_x, in_y, width - in_x, height - in_y)
+            out[n] = max(inside, -to_border)
 
 
 def signed_distance(

@@ -55,6 +55,7 @@ def without_specks(
     views: Sequence[View],
     silhouettes: Sequence[NDArray[np.floating]],
     scratch: Path | None = None,
+    workers: int = 1,
 ) -> tuple[list[View], Sequence[NDArray[np.floating]], dict[str, int]]:
     """Views without the small parts of silhouettes that all other views exclude.
 
@@ -69,6 +70,8 @@ def without_specks(
         Coverage, one for each view.
     scratch : Path, optional
         Folder for files in which distances are kept instead of in memory.
+    workers : int
+        Threads.
 
     Returns
     -------
@@ -91,7 +94,7 @@ def without_specks(
     box = robust_bounds(inner)
     if box is None:
         return list(views), silhouettes, {}
-    votes = votes_of(inner, *box)
+    votes = votes_of(inner, *box, workers)
     kept_views, clean, removed = list(views), Cleaned(silhouettes), dict[str, int]()
     for number, parts in enumerate(small):
         if not parts.count:

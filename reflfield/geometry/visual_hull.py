@@ -29,11 +29,9 @@ from reflfield.geometry.explanations import (
     compared_pixels,
     explain_all,
     explain_view,
-    overlap,
-    silhouette_of,
 )
+from reflfield.geometry.hull_agreement import Agreement, agreement_of
 from reflfield.geometry.mesh import Mesh, decimate, keep_large_components, smooth
-from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.specks import noting_small_parts, specks_words, without_specks
 from reflfield.util.quoting import listed
 from reflfield.util.validation import check_ranges
@@ -234,7 +232,7 @@ def visual_hull(
     """
     options = options or HullOptions()
     views = measured_views(cameras, silhouettes, scratch, workers)
-    views, silhouettes, specks = without_specks(views, silhouettes, scratch)
+    views, silhouettes, specks = without_specks(views, silhouettes, scratch, workers)
     bears_wrong = made and options.tolerance == AUTO and len(views) >= _MANY_MADE
     n_wrong = len(views) // MADE_VIEWS_PER_WRONG if bears_wrong else 0
     with noting_small_parts(views):
@@ -243,7 +241,7 @@ def visual_hull(
         if outcome is None:
             outcome = _agreed_hull(views, silhouettes, carver, scratch)
     grid, mesh = outcome.carved.grid, outcome.carved.mesh
-    agreement = outcome.fit or _agreement(mesh, cameras, silhouettes)
+    agreement = outcome.fit or agreement_of(mesh, cameras, silhouettes, workers)
     report = HullReport(
         spacing=grid.spacing,
         grid=grid.shape,
@@ -281,7 +279,7 @@ class _Outcome:
     contradictions: tuple[Contradiction, ...] = ()
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    fit: _Agreement | None = None
+    fit: Agreement | None = None
 
 
 @dataclass(frozen=True)
@@ -311,7 +309,8 @@ def _hull_of_made(
         carved = carver.carved(views, n_wrong)
     except GeometryError:
         return None
-    fit = _agreement(carved.mesh, [view.camera for view in views], silhouettes)
+    cameras = [view.camera for view in views]
+    fit = agreement_of(carved.mesh, cameras, silhouettes, carver.workers)
     return _Outcome(carved, fit=fit) if np.median(fit.overlap) > MADE_OVERLAP else None
 
 
@@ -328,7 +327,8 @@ def _agreed_hull(
         carved, failure = carver.carved(views, tolerance), None
     except GeometryError as error:
         carved, failure = None, error
-    fit = None if carved is None else _agreement(carved.mesh, cameras, silhouettes)
+    n = carver.workers
+    fit = None if carved is None else agreement_of(carved.mesh, cameras, silhouettes, n)
     if carved is not None and fit is not None and not _suspicious(views, carved, fit):
         return _Outcome(carved, fit=fit)
     disagreement = Disagreement.of(views, options.bounds)
@@ -418,26 +418,7 @@ def _contradictions(
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Agreement:
-    """How a mesh agrees with silhouettes.
-
-    Parameters
-    ----------
-    overlap : (n_views,) float64
-        Intersection over union.
-    missing : (n_views,) float64
-        Share of each silhouette that the mesh does not cover.
-    lost : list of (rows, columns) bool
-        Compared pixels of each silhouette that the mesh does not cover.
-    """
-
-    overlap: Array
-    missing: Array
-    lost: list[NDArray[np.bool_]]
-
-
-def _suspicious(views: Sequence[View], carved: _Carved, fit: _Agreement) -> bool:
+def _suspicious(views: Sequence[View], carved: _Carved, fit: Agreement) -> bool:
     """Whether a hull misses more of a silhouette than its voxels and blurred edges explain."""
     if fit.missing.max() > _SUSPICIOUS_IF_THIN:
         return True
@@ -453,22 +434,6 @@ def _suspicious(views: Sequence[View], carved: _Carved, fit: _Agreement) -> bool
         if inner.sum() > _SUSPICIOUS * (depth > 0.0).sum():
             return True
     return False
-
-
-def _agreement(
-    mesh: Mesh, cameras: Sequence[Camera], silhouettes: Sequence[NDArray[np.floating]]
-) -> _Agreement:
-    scene = RayScene(mesh)
-    overlaps, missing = np.zeros(len(cameras)), np.zeros(len(cameras))
-    lost = []
-    for number, (camera, silhouette) in enumerate(zip(cameras, silhouettes, strict=True)):
-        some, _, _ = compared_pixels(camera)
-        shown = np.asarray(silhouette)[some, some] >= 0.5
-        hit = silhouette_of(scene, camera)
-        overlaps[number] = overlap(shown, hit)
-        lost.append(shown & ~hit)
-        missing[number] = lost[-1].sum() / max(shown.sum(), 1)
-    return _Agreement(overlaps, missing, lost)
 
 
 def _check_inside(volume: NDArray[np.float32], views: Sequence[View]) -> None:

@@ -98,8 +98,9 @@ class HullViews:
         silhouettes = results.silhouettes(context)
         chosen = [silhouettes[i] for i in self.numbers]
         cameras = [context.training.cameras[i] for i in self.numbers]
-        views = measured_views(cameras, chosen, workers=context.resources.workers)
-        return list(without_specks(views, chosen, None)[0])
+        workers = context.resources.workers
+        views = measured_views(cameras, chosen, workers=workers)
+        return list(without_specks(views, chosen, workers=workers)[0])
 
 
 def _hull_views(context: Context) -> HullViews:
