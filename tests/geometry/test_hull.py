@@ -227,3 +227,34 @@ def test_distances_that_some_views_undercut_do_not_depend_on_how_they_are_found(
         distances.append(carving.smallest_distance(measured, points, tolerance, np.inf))
     np.testing.assert_array_equal(*distances)
     assert np.isfinite(distances[0]).all() == (tolerance < 18)
+
+
+@pytest.mark.parametrize("tolerance", [0, 3, 5])
+def test_points_far_outside_are_pursued_no_further_and_threads_change_nothing(
+    rng, monkeypatch, tolerance
+):
+    views = rigs.cameras(18, size=48)
+    measured = measured_views(views, [rigs.ball_silhouette(v, samples=2) for v in views])
+    points = rng.normal(size=(3000, 3)) * 0.7
+    monkeypatch.setattr(carving, "_PARTITIONED_POINTS", 700)
+    monkeypatch.setattr(carving, "_BLOCK_POINTS", 900)
+    exact = carving.smallest_distance(measured, points, tolerance, np.inf)
+    one, three = (
+        carving.smallest_distance(measured, points, tolerance, 0.1, n) for n in (1, 3)
+    )
+    np.testing.assert_array_equal(one, three)
+    near = exact >= -0.1
+    assert 0.1 < near.mean() < 0.9
+    np.testing.assert_array_equal(one[near], exact[near])
+    assert (one[~near] < -0.1).all()
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_hull_does_not_depend_on_threads(made):
+    views = rigs.cameras(64, size=48)
+    silhouettes = [rigs.ball_silhouette(v, samples=2) for v in views]
+    options = HullOptions(resolution=24, smoothing=0, n_triangles=0)
+    one, four = (visual_hull(views, silhouettes, options, made=made, workers=n) for n in (1, 4))
+    np.testing.assert_array_equal(one[0].vertices, four[0].vertices)
+    np.testing.assert_array_equal(one[1].overlap, four[1].overlap)
+    assert one[1].tolerance == four[1].tolerance == (6 if made else 0)

@@ -1,8 +1,13 @@
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from reflfield.errors import GeometryError, InputError
-from reflfield.geometry.silhouette_distance import _coarse_distance, signed_distance
+from reflfield.geometry.silhouette_distance import (
+    SignedDistance,
+    _coarse_distance,
+    signed_distance,
+)
 
 SIZE, SUPERSAMPLING = 96, 16
 centres = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=-1)
@@ -67,6 +72,44 @@ def test_outside_the_frame_is_empty_unless_the_object_leaves_it():
     assert cropped.leaves_image
     assert cropped.at(np.array([[-5.0, 10.0], [30.0, 10.0]])).min() > 0.0
     assert cropped.at(np.array([[17.5, 2.5]]))[0] < 0.0
+
+
+def by_scipy(distance, pixels):
+    """`SignedDistance.at`, by SciPy's interpolation."""
+    height, width = distance.values.shape
+    limit = np.array([width, height], float)
+    nearest = np.clip(pixels, 0, limit)
+    beyond = np.hypot(*(pixels - nearest).T)
+    inside = ndimage.map_coordinates(
+        distance.values.astype(float), (nearest - 0.5).T[::-1], order=1, mode="nearest"
+    )
+    if not distance.leaves_image:
+        return inside - beyond
+    to_border = np.minimum(nearest, limit - nearest).min(axis=1)
+    return np.where(beyond > 0, beyond, np.maximum(inside, -to_border))
+
+
+@pytest.mark.parametrize("leaves_image", [False, True])
+@pytest.mark.parametrize("shape", [(20, 31), (1, 31), (20, 1), (2, 2), (1, 1)])
+def test_distances_anywhere_are_those_of_scipy(rng, shape, leaves_image):
+    rim = np.zeros((int(leaves_image), 2))
+    values = rng.normal(size=shape).astype(np.float32)
+    distance = SignedDistance(values, np.zeros((0, 2)), rim)
+    pixels = rng.uniform(-8, 8 + max(shape), (4000, 2))
+    on_grid = np.round(2 * pixels) / 2  # centres, corners and borders
+    for places in (pixels, on_grid):
+        np.testing.assert_allclose(
+            distance.at(places), by_scipy(distance, places), rtol=0, atol=1e-13
+        )  # a dozen roundings of numbers below 60
+
+
+@pytest.mark.stability
+def test_distances_of_extreme_places_are_bounded_or_missing():
+    distance = SignedDistance(np.ones((3, 4), np.float32), np.zeros((0, 2)), np.zeros((0, 2)))
+    far = distance.at(np.array([[1e300, 0.0], [-np.inf, 1.0], [0.0, -1e12]]))
+    assert (far <= 1 - 1e12).all()
+    assert np.isnan(distance.at(np.array([[np.nan, 0.0], [1.0, np.nan]]))).all()
+    assert distance.at(np.zeros((0, 2))).shape == (0,)
 
 
 @pytest.mark.parametrize(("value", "seen"), [(0.0, "no pixel"), (1.0, "every pixel")])

@@ -9,8 +9,8 @@ import pytest
 from reflfield.capture.lights import Light
 from reflfield.field.indirect_light import IndirectLight
 from reflfield.observations.stored_shade import StoredShade
-from reflfield.pipeline import results
-from reflfield.pipeline.bounce_fit import with_bounced_light
+from reflfield.pipeline import bounce_fit, results
+from reflfield.pipeline.bounce_fit import LEAST_GAIN, with_bounced_light
 from reflfield.pipeline.pipeline_options import IndirectOptions
 from tests.render.test_bounced_light import SIDE, bounced_light, corner_surface, field_of
 
@@ -93,6 +93,16 @@ def test_harmonics_stay_alone_where_shadows_show_no_bounced_light(corner, rest):
     context, field, _ = corner(0.0, rest=rest * np.linspace(0, 1, N_LIGHTS)[::-1, None])
     before = harmonics(field.n_texels)
     assert with_bounced_light(context, field, before) is before
+
+
+def test_gain_that_only_few_lights_show_counts_as_none(corner, monkeypatch):
+    """As under a flash, whose stray light is in the shadows."""
+    context, field, _ = corner(1.0, rest=0.0)
+    before = harmonics(field.n_texels)
+    gains = iter([np.full(3, 2 * LEAST_GAIN), np.full(3, 0.9 * LEAST_GAIN)])
+    monkeypatch.setattr(bounce_fit, "_gain", lambda *_: next(gains))
+    assert with_bounced_light(context, field, before) is before
+    assert not list(gains)
 
 
 def test_without_shadows_or_not_asked_for_nothing_changes(corner, monkeypatch):

@@ -14,6 +14,8 @@ from reflfield.field.file import open_field
 from reflfield.field.half_vector import HalfVectorOptions
 from reflfield.fitting.lobe_count import fewest_lobes
 from reflfield.geometry.mesh import read_ply
+from reflfield.geometry.occlusion import depth_edges
+from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.uv_atlas import AtlasOptions
 from reflfield.geometry.visual_hull import HullOptions
 from reflfield.options import HoldOut, Resources
@@ -116,6 +118,20 @@ def test_the_hull_stays_where_no_surface_is_asked_for(tiny_capture, tmp_path):
     half_vector_run(tiny_capture, tmp_path, replace(OPTIONS, compression=compression))
     assert open_field(tmp_path / "field.rfld").model == "half_vector"
     assert not (tmp_path / "surface.ply").exists()
+
+
+@pytest.mark.parametrize("on_surface", [False, True])
+def test_kept_depth_edges_are_those_of_the_surface_that_is_fitted(
+    tiny_capture, made, context_of, on_surface
+):
+    context = replace(
+        context_of(open_capture(tiny_capture), made, OPTIONS), on_surface=on_surface
+    )
+    scene = RayScene(results.atlas(context).mesh)
+    for view, camera in enumerate(context.training.cameras):
+        edges = depth_edges(scene, camera, OPTIONS.visibility)
+        assert edges.any()
+        np.testing.assert_array_equal(results.depth_edges(context, view), edges)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from reflfield.errors import InputError
-from reflfield.util.blas_threads import one_core_blas
+from reflfield.pipeline.stage import Stage
+from reflfield.util.blas_threads import one_core_blas, thread_pool
 from reflfield.util.blocks import BlockFiles, Blocks, Scheduler, Tally
 from reflfield.util.progress import listening
 
@@ -157,3 +158,25 @@ def test_blas_has_its_threads_back_when_holders_of_the_limit_overlap():
         assert blas_threads() == 1
         second.__exit__(None, None, None)
         assert blas_threads() == 2
+
+
+def test_threads_of_a_pool_have_one_of_the_blas_each():
+    with threadpool_limits(limits=2, user_api="blas"):
+        with thread_pool(0) as pool:  # at least one
+            assert pool.submit(blas_threads).result() == 1
+        assert blas_threads() == 2
+
+
+@pytest.mark.parametrize("large_products", [False, True])
+def test_blas_has_threads_in_stages_with_large_products_alone(large_products, tmp_path):
+    found = []
+
+    def compute(context, folder):
+        found.append(blas_threads())
+        return {}
+
+    stage = Stage("some", compute, large_products=large_products)
+    with threadpool_limits(limits=2, user_api="blas"):
+        stage._computed(None, tmp_path)
+        assert blas_threads() == 2
+    assert found == [2 if large_products else 1]
