@@ -296,7 +296,9 @@ def _skews(
         return out
 
     sums = list(pool.map(one, rows.parts()))
-    matrix, right = (np.sum([part[i] for part in sums], axis=0) for i in (0, 1))
+    lower, right = (np.sum([part[i] for part in sums], axis=0) for i in (0, 1))
+    diagonal = np.eye(n) * lower
+    matrix = lower + np.swapaxes(lower, 1, 2) - diagonal
     free = np.tile(FREE_SKEWS, model.n_lobes)
     prior = np.kron(np.eye(model.n_lobes), SKEW_PRIOR) * (SKEW_TIE * rows.n_rows / SKEW_NODES)
     skews = np.zeros((3, n))

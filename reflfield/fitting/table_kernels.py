@@ -291,29 +291,77 @@ def _add_diffuse(t: int, corners: Any, model: Any, tables: Any, out: Any) -> Non
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _add_rings(ring: Any, share: Any, fd: Any, parts: Any, line: Any) -> None:
-    """Add derivatives of a row by the skews, through one entry, to `line` (K, nodes, 3)."""
-    fr, turn = share[0], share[1]
-    for m in range(4):
-        w = (fr if m & 1 else 1 - fr) * (fd if m & 2 else 1 - fd) * turn
-        node = ring + (m & 1) + (m >> 1) * SKEW_RINGS
-        for k in range(parts.shape[0]):
+def _add_sums(parts: Any, out: Any) -> None:
+    """Add the sums of parts (K, 3) over lobes to `out` (3,)."""
+    for k in range(parts.shape[0]):
+        for c in range(3):
+            out[c] += parts[k, c]
+
+
+@numba.njit(cache=True, nogil=True, forceinline=True)
+def _clear(line: Any, touched: Any, n_touched: int) -> None:
+    """Put the nodes of `line` that were touched back to zero."""
+    for i in range(n_touched):
+        for k in range(line.shape[0]):
             for c in range(3):
-                line[k, node, c] += w * parts[k, c]
+                line[k, touched[i], c] = 0.0
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
-def _add_square(line: Any, c: int, weight: Any, residual: Any, matrix: Any, right: Any) -> None:
-    """Add one channel of a row to its normal equations; most of `line` (n, 3) is zero."""
-    for x in range(len(line)):
-        scaled = weight * line[x, c]
-        if scaled != 0.0:
-            right[x] += scaled * residual
-            for y in range(len(line)):
-                matrix[x, y] += scaled * line[y, c]
+def _add_rings(
+    e: int,
+    ring: Any,
+    share: Any,
+    taps: Any,
+    parts: Any,
+    line: Any,
+    touched: Any,
+    n_touched: int,
+) -> int:
+    """Add derivatives of a row by the skews, through one entry, to `line` (K, nodes, 3).
+
+    The first `n_touched` of `touched` are the nodes that the row depends on; how many they are
+    with those of this entry is returned.
+    """
+    fr, turn, fd = share[e, 0], share[e, 1], taps[1][e, 2]
+    for m in range(4):
+        w = (fr if m & 1 else 1 - fr) * (fd if m & 2 else 1 - fd) * turn
+        node = ring[e] + (m & 1) + (m >> 1) * SKEW_RINGS
+        known = False
+        for i in range(n_touched):
+            known |= touched[i] == node
+        if not known:
+            touched[n_touched] = node
+            n_touched += 1
+        for k in range(parts.shape[0]):
+            for c in range(3):
+                line[k, node, c] += w * parts[k, c]
+    return n_touched
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, forceinline=True)
+def _add_square(
+    line: Any, touched: Any, n_touched: int, c: int, weight: Any, residual: Any, out: Any
+) -> None:
+    """Add one channel of a row to its normal equations: of the nodes of `line` touched.
+
+    Of the matrix, which is symmetric, what lies not above the diagonal in the order of lobes
+    and of nodes touched.
+    """
+    matrices, rights = out
+    n_lobes, n_nodes, _ = line.shape
+    for k in range(n_lobes):
+        for i in range(n_touched):
+            x = k * n_nodes + touched[i]
+            scaled = weight * line[k, touched[i], c]
+            rights[c, x] += scaled * residual
+            for m in range(k + 1):
+                for j in range(n_touched if m < k else i + 1):
+                    y = m * n_nodes + touched[j]
+                    matrices[c, x, y] += scaled * line[m, touched[j], c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def add_skew_system(
     first: Any,
     texel: Any,
@@ -327,25 +375,29 @@ def add_skew_system(
 ) -> None:
     """Add the normal equations of the skews, one system for each channel, to `out`.
 
-    `out` is the matrices (3, n, n) and right sides (3, n) of n = K * SKEW_NODES unknowns.
+    `out` is the matrices (3, n, n) and right sides (3, n) of n = K * SKEW_NODES unknowns. Of
+    two elements of a matrix that are equal, one gets a part and the other the rest.
     """
     ring_node, ring_share, spread = rings
     values, weight = observed
     n_lobes, n = model[1].shape[1], out[1].shape[1]
     line, corners = np.zeros((n_lobes, n // n_lobes, 3)), _empty_corners()
-    flat = line.reshape((n, 3))
+    touched, n_touched = np.zeros(n // n_lobes, np.int64), 0
     shown, parts = np.zeros(3, np.float32), np.zeros((n_lobes, 3), np.float32)
     for row in range(len(weight)):
-        shown[:] = np.float32(0.0)
-        line[:] = 0.0
+        _clear(line, touched, n_touched)
+        n_touched = 0
+        for c in range(3):
+            shown[c] = np.float32(0.0)
         for e in range(first[row], first[row + 1]):
             _place_entry(e, taps, factor, corners)
             _lobe_parts(texel[e], corners, spread[e], model, tables, parts)
             _add_diffuse(texel[e], corners, model, tables, shown)
-            for c in range(3):
-                shown[c] += parts[:, c].sum()
-            _add_rings(ring_node[e], ring_share[e], taps[1][e, 2], parts, line)
+            _add_sums(parts, shown)
+            n_touched = _add_rings(
+                e, ring_node, ring_share, taps, parts, line, touched, n_touched
+            )
         for c in range(3):
             if weight[row, c] > 0:
                 residual = values[row, c] - shown[c]
-                _add_square(flat, c, weight[row, c], residual, out[0][c], out[1][c])
+                _add_square(line, touched, n_touched, c, weight[row, c], residual, out)

@@ -261,8 +261,7 @@ def checked_read(
         If a chunk is missing or damaged.
     """
     try:
-        # One chunk after the other for indices, whole chunks for slices.
-        samples = array[rows] if isinstance(rows, slice) else array.oindex[np.asarray(rows)]
+        samples = array[rows] if isinstance(rows, slice) else _some_rows(array, rows)
     except ValueError as error:
         raise InputError(
             f"{location}: expected chunks that agree with their checksums, found one that "
@@ -275,6 +274,25 @@ def checked_read(
             f"{location}: expected all chunks, found some missing; compute the stage again "
             "with `from_stage='observations'`"
         )
+    return samples
+
+
+def _some_rows(array: zarr.Array, rows: NDArray[np.integer]) -> NDArray[np.float16]:
+    """Rows in any order, chunk by chunk.
+
+    Of ascending ones whole parts of a chunk are read, and the rows taken from them here: zarr
+    would pick them in its one thread, which all others wait for.
+    """
+    rows = np.asarray(rows)
+    if not len(rows) or (np.diff(rows) < 0).any():
+        return np.asarray(array.oindex[rows])
+    samples = np.zeros((len(rows), *array.shape[1:]), np.float16)
+    _, first = np.unique(rows // array.chunks[0], return_index=True)
+    ends = [*first[1:].tolist(), len(rows)]
+    for begin, end in zip(first.tolist(), ends, strict=True):
+        low, high = int(rows[begin]), int(rows[end - 1]) + 1
+        part = np.asarray(array[low:high])
+        samples[begin:end] = part[rows[begin:end] - low]
     return samples
 
 
@@ -457,7 +475,8 @@ def _opened_array(location: Location, mode: Literal["r", "r+"]) -> zarr.Array:
     """What is there; FileNotFoundError if nothing is."""
     store = opened(location)
     try:
-        with naming(str(location)):
+        # No chunk is empty: whether it is, takes long to find out.
+        with naming(str(location)), zarr.config.set({"array.write_empty_chunks": True}):
             return zarr.open_array(store, mode=mode)
     except OSError:
         raise

@@ -22,6 +22,7 @@ from reflfield.fitting.table_fit import (
     fit_tables,
     normalised_tables,
 )
+from reflfield.fitting.table_kernels import add_skew_system
 from tests.fitting.conftest import random_model, unit
 
 
@@ -201,6 +202,43 @@ def skewed_truth(rng, n_lobes=2):
     skews = np.zeros_like(model.skews)
     skews[:, FREE_SKEWS] = np.array([-0.6, 0.0, 0.3], np.float32)
     return normalised_tables(replace(model, skews=skews))
+
+
+@pytest.mark.parametrize("per_row", [1, 3])
+def test_normal_equations_of_skews_are_those_of_their_derivatives(small_rng, per_row):
+    """A row is linear in the skews: its derivatives are differences, of any size."""
+    model = random_model(small_rng, n_lobes=2)
+    model = replace(model, skews=np.zeros_like(model.skews))
+    rows = random_rows(small_rng, model, 60, per_row)
+    values = shown(model, rows) + small_rng.normal(0, 0.05, (60, 3)).astype(np.float32)
+    values[::7, 1] = np.nan
+    rows = replace(rows, values=values)
+    tables = (np.ascontiguousarray(np.moveaxis(model.lobes, 0, 1)), model.diffuse_table)
+    n = model.n_lobes * SKEW_NODES
+    out = np.zeros((3, n, n)), np.zeros((3, n))
+    with ThreadPoolExecutor(1) as pool:
+        linearised = table_fit._linearised(rows, model, pool)
+    add_skew_system(
+        *(rows.first, rows.texel, linearised.taps, linearised.rings, linearised.factor),
+        *((rows.values, linearised.weight), (model.diffuse, model.weights), tables, out),
+    )
+    derivatives = np.zeros((n, 60, 3))
+    for i in range(n):
+        skews = np.zeros((model.n_lobes * SKEW_NODES, 3), np.float32)
+        skews[i] = 0.5
+        changed = replace(model, skews=skews.reshape(model.skews.shape))
+        derivatives[i] = (shown(changed, rows) - shown(model, rows)) / 0.5
+    residual = np.where(linearised.weight > 0, values - shown(model, rows), 0)
+    for c in range(3):
+        weighted = derivatives[..., c] * linearised.weight[:, c]
+        matrix = out[0][c] + out[0][c].T - np.diag(np.diag(out[0][c]))
+        size = np.abs(weighted @ derivatives[..., c].T).max()
+        # Differences of numbers in singles.
+        np.testing.assert_allclose(
+            matrix, weighted @ derivatives[..., c].T, rtol=0, atol=1e-4 * size
+        )
+        right = weighted @ residual[:, c]
+        np.testing.assert_allclose(out[1][c], right, rtol=0, atol=1e-4 * np.abs(right).max())
 
 
 def test_planted_skews_are_recovered(small_rng, monkeypatch):

@@ -53,8 +53,16 @@ class TestReading:
 
     @pytest.mark.parametrize(
         "texels",
-        [[2499, 0, 1024, 1023], [5, 5, 5], [7], [], [2048, 3, 2048, 1500, 3]],
-        ids=["unsorted", "repeated", "one", "none", "both"],
+        [
+            [2499, 0, 1024, 1023],
+            [5, 5, 5],
+            [7],
+            [],
+            [2048, 3, 2048, 1500, 3],
+            [3, 900, 1023, 1024, 1024, 2040, 2499],
+            range(1000, 2500),
+        ],
+        ids=["unsorted", "repeated", "one", "none", "both", "ascending", "without gaps"],
     )
     def test_by_index(self, written, texels):
         stored, values = written
