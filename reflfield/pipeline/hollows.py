@@ -25,6 +25,7 @@ from reflfield.geometry.specks import without_specks
 from reflfield.geometry.stereo_carving import MOST_VIEWS, carved_by_stereo
 from reflfield.pipeline import results
 from reflfield.pipeline.context import Context
+from reflfield.pipeline.memory import readers_at_once
 from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
@@ -98,7 +99,7 @@ class HullViews:
         silhouettes = results.silhouettes(context)
         chosen = [silhouettes[i] for i in self.numbers]
         cameras = [context.training.cameras[i] for i in self.numbers]
-        workers = context.resources.workers
+        workers = min(context.resources.workers, readers_at_once(context))
         views = measured_views(cameras, chosen, workers=workers)
         return list(without_specks(views, chosen, workers=workers)[0])
 

@@ -19,7 +19,7 @@ from reflfield.geometry.visual_hull import HullReport, visual_hull
 from reflfield.pipeline import results
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
-from reflfield.pipeline.memory import keeps_distances
+from reflfield.pipeline.memory import keeps_distances, readers_at_once
 from reflfield.util.quoting import listed
 
 # Among the counts of the hull: names of the views that it is made without.
@@ -63,7 +63,8 @@ def _carved(context: Context, folder: Path) -> tuple[Mesh, HullReport]:
     made = _is_made(context, 0)
 
     def carved(scratch: Path | None) -> tuple[Mesh, HullReport]:
-        workers = context.resources.workers
+        # Distances of an image take what reading a photograph does.
+        workers = min(context.resources.workers, readers_at_once(context))
         return visual_hull(
             cameras, silhouettes, options, scratch=scratch, made=made, workers=workers
         )
