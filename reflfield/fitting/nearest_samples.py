@@ -1,12 +1,14 @@
 r"""What a texel's own samples tell of views left out, without any model.
 
-The sample for view v and light l is predicted by the mean of the texel's other samples, those
-for near directions first:
+The sample for view v and light l is predicted by the mean of the texel's samples under other
+lights, those for near directions first:
 
 .. math:: \hat f(v, l) = \frac{\sum_i w_i f_i}{\sum_i w_i}, \qquad
           w_i = \exp\Big(-\frac{|v - v_i|^2 + |l - l_i|^2}{2 h^2}\Big)
 
-(Nadaraya and Watson's estimate). Functions of the half vector that predict no better say
+(Nadaraya and Watson's estimate). Samples under the same light are no use: they tell what a matt
+texel shows from another view, and nothing of other lights. Where there are none but those,
+they are taken. Functions of the half vector that predict no better say
 nothing of the object: a texel is not one place of a surface. That is so of a hull that closes a
 bowl with a lid, where a texel shows another place of the inside from each view.
 """
@@ -31,6 +33,8 @@ WIDTHS = (0.1, 0.15, 0.2, 0.3)
 MOST_PAIRS = 100_000_000
 # Weight of a sample however far it is, so that there is always a mean.
 LEAST_WEIGHT = 1e-30
+# Square of the chord between directions of lights that count as one.
+SAME_LIGHT = 1e-6
 
 
 def nearest_samples_error(
@@ -50,6 +54,14 @@ def nearest_samples_error(
         With the best of `WIDTHS`, in the units of `texel_sample_fit.solve_coefficients`; 0
         where nothing can be predicted.
     """
+    apart = _error(fitted, measured, pool, SAME_LIGHT)
+    return apart if apart > 0 else _error(fitted, measured, pool, -1.0)
+
+
+def _error(
+    fitted: SampleBlocks, measured: SampleBlocks, pool: ThreadPoolExecutor, apart: float
+) -> float:
+    """`nearest_samples_error` by samples whose lights are so far apart, squared, at least."""
     numbers = range(fitted.n_blocks)
     pairs = sum(pool.map(lambda n: _pairs(fitted[n], measured[n]), numbers))
     every = max(1, -(-pairs // MOST_PAIRS))
@@ -58,7 +70,7 @@ def nearest_samples_error(
         sums = np.zeros((len(WIDTHS), 2))
         known, asked = (_arrays(blocks[number]) for blocks in (fitted, measured))
         for width, out in zip(WIDTHS, sums, strict=True):
-            _add_errors(known, asked, every, -0.5 / width**2, out)
+            _add_errors(known, asked, every, (-0.5 / width**2, apart), out)
         return sums
 
     parts = list(pool.map(one, numbers))
@@ -79,16 +91,20 @@ def _arrays(block: SampleBlock) -> tuple[Any, ...]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _mean(known: Any, row: int, towards: Any, scale: float, mean: Any) -> None:
+def _mean(known: Any, row: int, towards: Any, kernel: Any, mean: Any) -> None:
     """Mean of a texel's samples for one channel each; NaN where there is none."""
     first, directions, values = known
+    scale, apart = kernel
     total = np.zeros(3)
     mean[:] = 0.0
     for i in range(first[row], first[row + 1]):
-        square = 0.0
-        for axis in range(6):
-            square += (directions[i, axis] - towards[axis]) ** 2
-        weight = np.exp(scale * square) + LEAST_WEIGHT
+        of_view = of_light = 0.0
+        for axis in range(3):
+            of_view += (directions[i, axis] - towards[axis]) ** 2
+            of_light += (directions[i, 3 + axis] - towards[3 + axis]) ** 2
+        if of_light < apart:
+            continue
+        weight = np.exp(scale * (of_view + of_light)) + LEAST_WEIGHT
         for c in range(3):
             if not np.isnan(values[i, c]):
                 mean[c] += weight * values[i, c]
@@ -98,13 +114,13 @@ def _mean(known: Any, row: int, towards: Any, scale: float, mean: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_errors(known: Any, asked: Any, every: int, scale: float, out: Any) -> None:
+def _add_errors(known: Any, asked: Any, every: int, kernel: Any, out: Any) -> None:
     """Add weighted squared errors of the asked samples, and how many values they are."""
     first, directions, values = asked
     mean = np.zeros(3)
     for row in range(len(first) - 1):
         for s in range(first[row] + row % every, first[row + 1], every):
-            _mean(known, row, directions[s], scale, mean)
+            _mean(known, row, directions[s], kernel, mean)
             for c in range(3):
                 y, shown = values[s, c], np.float32(mean[c])
                 if not np.isnan(y) and not np.isnan(shown):

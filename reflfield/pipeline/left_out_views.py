@@ -17,7 +17,7 @@ from reflfield.pipeline.results import LEFT_OUT_ERRORS
 
 # In the record of the stage.
 LOBE_ERRORS = "weighted error of views left out, by the number of lobes"
-NEAREST_ERROR = "that of the mean of a texel's nearest samples"
+NEAREST_ERROR = "that of the mean of a texel's nearest samples under other lights"
 
 
 def write_left_out_views(context: Context, folder: Path) -> dict[str, Any]:

@@ -33,21 +33,28 @@ def error_of(fitted, measured):
 
 
 def samples_of(block, texel):
-    """Directions (n, 6) and values (n, 3) of one texel's samples, float64."""
+    """Directions (n, 6), values (n, 3) and numbers of the lights of one texel's samples."""
     own = slice(block.first[texel], block.first[texel + 1])
     views, lights = block.views[texel, block.view[own]], block.lights[texel, block.light[own]]
-    return np.concatenate([views, lights], axis=1, dtype=np.float64), block.values[own]
+    directions = np.concatenate([views, lights], axis=1, dtype=np.float64)
+    return directions, block.values[own], block.light[own]
 
 
-def test_error_is_that_of_the_weighted_means(block):
+@pytest.mark.parametrize("n_lights", ["many", "one"])
+def test_error_is_that_of_the_weighted_means_under_other_lights(block, n_lights):
+    """Of one light there are no others: its own samples are taken."""
+    if n_lights == "one":
+        block.lights[:] = block.lights[:, :1]
     fitted, measured = parts_of(block)
     squares = np.zeros((len(WIDTHS), 2))
     for texel in range(len(block.texels)):
-        known, values = samples_of(fitted[0], texel)
-        asked, truth = samples_of(measured[0], texel)
+        known, values, of_known = samples_of(fitted[0], texel)
+        asked, truth, of_asked = samples_of(measured[0], texel)
         square = np.square(asked[:, None] - known[None]).sum(axis=2)
         for width, out in zip(WIDTHS, squares, strict=True):
             weight = np.exp(-square / (2 * width**2)) + LEAST_WEIGHT
+            if n_lights == "many":
+                weight *= of_asked[:, None] != of_known
             weight = weight[..., None] * np.isfinite(values)
             shown = (weight * np.nan_to_num(values)).sum(axis=1) / weight.sum(axis=1)
             for y, s in zip(truth.ravel(), shown.astype(np.float32).ravel(), strict=True):
@@ -90,3 +97,9 @@ def test_directions_far_from_all_samples_still_have_a_mean(block):
     measured[0].views[:] *= 100.0
     assert np.isfinite(error_of(fitted, measured))
     assert error_of(fitted, measured) > 0.0
+
+
+def test_views_of_a_matt_texel_say_nothing_of_other_lights(block):
+    """Each light shows it as bright from all sides: another view of it tells no more."""
+    block.values[:] = np.random.default_rng(5).random(32)[block.light][:, None]
+    assert error_of(*parts_of(block)) > 0.05

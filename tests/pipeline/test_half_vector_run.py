@@ -158,8 +158,8 @@ def test_auto_takes_the_model_that_the_samples_determine(
 @pytest.mark.parametrize(
     ("errors", "nearest", "model", "said"),
     [
-        ((0.0839, 0.0876), 0.0850, "clustered", "hardly better than the mean of a texel"),
-        ((0.0388, 0.0376), 0.0451, "half_vector", "selected 1: with 1, 2 and more lobes"),
+        ((0.0807, 0.0840), 0.0971, "clustered", "hardly better than the mean of a texel"),
+        ((0.0388, 0.0376), 0.0814, "half_vector", "selected 1: with 1, 2 and more lobes"),
         # Nothing measured in the views left out says nothing against the model.
         ((0.0, 0.0), 0.0, "half_vector", "selected 1"),
     ],
@@ -167,7 +167,7 @@ def test_auto_takes_the_model_that_the_samples_determine(
 def test_auto_takes_clusters_where_nearest_samples_show_as_much(
     tiny_capture, tmp_path, context_of, monkeypatch, errors, nearest, model, said
 ):
-    """A bowl is no hull with a lid: unseen images of it were 4 dB worse."""
+    """Gold is seen in a bowl of gold: unseen images of it were 4 dB worse."""
     options = replace(OPTIONS, compression=CompressionOptions(model="auto"))
     context = context_of(open_capture(tiny_capture), tmp_path, options)
     measured = {"errors": np.array(errors), "nearest": np.array(nearest)}
@@ -186,7 +186,7 @@ def test_a_flash_never_gets_clusters(
 ):
     """Of one light for each view, clusters would be completed over pairs that all lack."""
     options = replace(OPTIONS, compression=CompressionOptions(model="auto"))
-    measured = {"errors": np.array([0.0839]), "nearest": np.array(0.0850)}
+    measured = {"errors": np.array([0.0839]), "nearest": np.array(0.0971)}
     monkeypatch.setattr(model_selection, "samples_per_texel", lambda context: 100)
     monkeypatch.setattr(model_selection.results, "left_out_errors", lambda context: measured)
 
