@@ -34,10 +34,10 @@ MODEL, LOBES = "compression.model", "compression.half_vector.n_lobes"
 # Few views or few lights tell less of normals, and more samples are asked for.
 LEAST_HALF_VECTOR, LEAST_OF_FEW, FEW = 8, 64, 6
 # Error on views left out that the half-vector model may have, over that of the mean of a
-# texel's nearest samples under other lights. A bowl that its hull closes with a lid has .94, one
-# of gold, which is seen in itself, .83, and unseen images of both are 4 dB better with clusters;
-# of objects that the model shows better .62 (brushed in another direction in each triangle) is
-# most, of others .39 to .52.
+# texel's nearest samples under other lights. A bowl that its hull closes with a lid has .94,
+# one of gold, which is seen in itself, .83, and unseen images of both are 4 dB better with
+# clusters; of objects that the model shows better .62 (brushed in another direction in each
+# triangle) is most, of others .39 to .52.
 LEAST_GAIN = 0.72
 # Share of all pairs of view and light that were photographed, below which clusters are never
 # preferred: a flash photographs one light from each view, and what completes a texel over all
