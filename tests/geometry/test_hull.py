@@ -7,6 +7,9 @@ import rigs
 from reflfield.errors import GeometryError, InputError
 from reflfield.geometry import carving
 from reflfield.geometry.cones import measured_views
+from reflfield.geometry.contradictions import votes_of
+from reflfield.geometry.hull_agreement import agreement_of
+from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.visual_hull import HullOptions, visual_hull
 
@@ -258,3 +261,28 @@ def test_hull_does_not_depend_on_threads(made):
     np.testing.assert_array_equal(one[0].vertices, four[0].vertices)
     np.testing.assert_array_equal(one[1].overlap, four[1].overlap)
     assert one[1].tolerance == four[1].tolerance == (6 if made else 0)
+
+
+def test_what_a_mesh_misses_of_silhouettes_is_not_what_it_adds():
+    """A ball half as wide as its silhouettes adds nothing, and misses three quarters."""
+    views = rigs.cameras(6, size=48)
+    silhouettes = [rigs.ball_silhouette(v, samples=2) for v in views]
+    mesh, _ = visual_hull(views, silhouettes, HullOptions(resolution=32, n_triangles=0))
+    small = Mesh(0.5 * mesh.vertices, mesh.faces)
+    agreement = agreement_of(small, views, silhouettes, 2)
+    # Pixels of the outlines, about 4 over the radius of ten pixels or more.
+    np.testing.assert_allclose(agreement.missing, 0.75, atol=0.1)
+    np.testing.assert_allclose(agreement.overlap, 0.25, atol=0.1)
+    shown = [(silhouette >= 0.5).sum() for silhouette in silhouettes]
+    lost = [part.sum() for part in agreement.lost]
+    np.testing.assert_allclose(np.divide(lost, shown), agreement.missing, atol=0.05)
+
+
+def test_votes_know_the_nearest_cone():
+    views = rigs.cameras(9, size=48)
+    measured = measured_views(views, [rigs.ball_silhouette(v, samples=2) for v in views])
+    low, high = np.full(3, -1.0), np.full(3, 1.0)
+    votes = votes_of(measured, low, high, workers=2)
+    cell = np.indices(votes.shape).reshape(3, -1).T + 0.5
+    distances = [view.distance(low + votes.spacing * cell) for view in measured]
+    np.testing.assert_array_equal(votes.nearest, np.min(distances, axis=0).astype(np.float32))
