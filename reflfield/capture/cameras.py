@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture import lenses
+from reflfield.capture.directions import Whereabouts, directions_towards, kernels
 from reflfield.errors import CaptureError
 from reflfield.util.validation import check_shape
+from reflfield.util.vector_lengths import lengths
 
 Array = NDArray[np.float64]
 
@@ -216,6 +218,11 @@ class Camera:
             If `points` is not (n, 3).
         """
         world = _points(points)
+        if self.kind == OPENCV and self.keeps_lines_straight:
+            pixels, depth = np.zeros((len(world), 2)), np.zeros(len(world))
+            points = np.ascontiguousarray(world)
+            kernels.project_straight(points, self.camera_from_world, self.matrix, pixels, depth)
+            return pixels, depth
         x_camera = world @ self.rotation.T + self.camera_from_world[:3, 3]
         depth = x_camera[:, 2]
         image = x_camera[:, :2] if self.kind == ORTHOGRAPHIC else self._through_lens(x_camera)
@@ -255,17 +262,20 @@ class Camera:
             return origins, np.tile(self.forward, (len(image), 1))
         ideal = image if self.keeps_lines_straight else self._before_lens(image)
         directions = ideal @ self.rotation[:2] + self.rotation[2]
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        directions /= lengths(directions)[:, None]
         return np.tile(self.centre, (len(image), 1)), directions
 
     def view_directions(self, points: ArrayLike) -> Array:
         """Unit directions (n, 3) from world points (n, 3) towards the camera."""
-        world = _points(points)
+        directions: Array = directions_towards(_points(points), [self.whereabouts])[:, 0]
+        return directions
+
+    @property
+    def whereabouts(self) -> Whereabouts:
+        """The camera's centre; of an orthographic one the direction towards it."""
         if self.kind == ORTHOGRAPHIC:
-            return np.tile(-self.forward, (len(world), 1))
-        towards = self.centre - world
-        distance = np.linalg.norm(towards, axis=1, keepdims=True)
-        return towards / np.maximum(distance, np.finfo(np.float64).tiny)
+            return Whereabouts(-self.forward, is_point=False)
+        return Whereabouts(self.centre, is_point=True)
 
     def contains(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether pixel coordinates (n, 2) lie in the image; (n,) bool, False for NaN.
@@ -294,8 +304,6 @@ class Camera:
         # A point almost in the camera's own plane overflows to inf: it is off the image.
         with np.errstate(over="ignore"):
             ideal = x_camera[:, :2] / depth[:, None]
-        if self.keeps_lines_straight:
-            return ideal
         beyond = ~(np.hypot(ideal[:, 0], ideal[:, 1]) < self._largest_radius)
         ideal[beyond] = np.nan
         if self.kind == FISHEYE:

@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reflfield.capture.directions import Whereabouts, directions_towards
 from reflfield.errors import CaptureError, InputError
 from reflfield.util.validation import check_shape, not_a_rotation_because
+from reflfield.util.vector_lengths import lengths
 
 Array = NDArray[np.float64]
 
@@ -164,12 +166,23 @@ class Light:
         InputError
             For an environment or a group, which have no single direction.
         """
-        world = self._points(points)
+        directions: Array = directions_towards(self._points(points), [self.whereabouts])[:, 0]
+        return directions
+
+    @property
+    def whereabouts(self) -> Whereabouts:
+        """Where the light is; +Z of the world for one that is unknown.
+
+        Raises
+        ------
+        InputError
+            For an environment or a group, which are at no single place.
+        """
+        self._check_single()
         if self.kind in (POINT, SPOT):
-            towards = self.position - world
-            return towards / self._distances(world)[:, None]
+            return Whereabouts(self.position, is_point=True)
         towards = np.array([0.0, 0.0, 1.0]) if self.kind == UNKNOWN else self.direction
-        return np.tile(towards, (len(world), 1))
+        return Whereabouts(towards, is_point=False)
 
     def distances(self, points: ArrayLike) -> Array:
         """Distances (n,) from world points (n, 3), metres; inf for far lights."""
@@ -202,20 +215,21 @@ class Light:
             return np.asarray(self.irradiance(points).any(axis=1))
         return np.full(len(self._points(points)), self.shines)
 
-    def _points(self, points: ArrayLike) -> Array:
+    def _check_single(self) -> None:
         if self.kind in (ENVIRONMENT, GROUP):
             raise InputError(
                 f"light {self.id!r}: expected a single light, received kind {self.kind!r}, "
                 "which has no single direction or irradiance; sum over its map or its members"
             )
+
+    def _points(self, points: ArrayLike) -> Array:
+        self._check_single()
         world = np.asarray(points, dtype=np.float64)
         check_shape("points", world, (None, 3))
         return world
 
     def _distances(self, world: Array) -> Array:
-        # Column by column: of three values a row NumPy's norm takes several times as long.
-        x, y, z = (self.position[d] - world[:, d] for d in range(3))
-        return np.maximum(np.sqrt(x * x + y * y + z * z), SMALLEST_DISTANCE)
+        return np.maximum(lengths(self.position - world), SMALLEST_DISTANCE)
 
     def _falloff(self, world: Array) -> Array:
         """Fraction (n,) of the spot's intensity that goes towards each point."""

@@ -397,66 +397,6 @@ def _add_direct_light(
     )
 
 
-def texel_taps(
-    field: ReflectanceField, uv: ArrayLike, transition: ArrayLike = 1.0
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Texels around texture coordinates and their bilinear weights.
-
-    Parameters
-    ----------
-    field : ReflectanceField
-        Field whose texture is read.
-    uv : (n, 2) float
-        Texture coordinates, v up; pixel centres at (column + 1/2) / width and
-        1 - (row + 1/2) / height. Outside [0, 1] the border is read.
-    transition : float or (n,) float
-        Width in texels, 0 to 1, over which neighbouring texels blend: 1 is bilinear, 0
-        takes the nearest. Where texels are no larger than pixels the average over a pixel's
-        rays blends already, and bilinear taps would blur a second time; see
-        `FieldSurface.transitions`.
-
-    Returns
-    -------
-    texels : (n, 4) int32
-        Texels of the four nearest pixels, -1 where a pixel has none.
-    weights : (n, 4) float32
-        Bilinear weights over the texels that exist; they sum to 1, or to 0
-        where none of the four exists.
-
-    Raises
-    ------
-    ShapeError
-        If `uv` is not (n, 2).
-
-    Notes
-    -----
-    The *samples* of the four texels are to be blended, not their frames or
-    coefficients: neighbours may belong to different clusters.
-    """
-    coordinates = np.asarray(uv, dtype=np.float64)
-    check_shape("uv", coordinates, (None, 2))
-    height, width = field.texel_of_pixel.shape
-    column, s = _pixel_taps(coordinates[:, 0] * width - 0.5, width, transition)
-    row, t = _pixel_taps((1.0 - coordinates[:, 1]) * height - 0.5, height, transition)
-    texels = field.texel_of_pixel[row[:, [0, 0, 1, 1]], column[:, [0, 1, 0, 1]]]
-    weights = t[:, [0, 0, 1, 1]] * s[:, [0, 1, 0, 1]] * (texels >= 0)
-    total = weights.sum(axis=1, keepdims=True)
-    np.divide(weights, total, out=weights, where=total > 0)
-    return texels, weights.astype(np.float32)
-
-
-def _pixel_taps(
-    position: NDArray[np.float64], size: int, transition: ArrayLike
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Two neighbouring pixels and their shares along one axis, clamped to the image."""
-    inside = np.clip(position, 0.0, size - 1.0)
-    lower = np.minimum(inside.astype(np.intp), max(size - 2, 0))
-    steep = 1.0 / np.maximum(np.asarray(transition, np.float64), 1e-6)
-    share = np.clip((inside - lower - 0.5) * steep + 0.5, 0.0, 1.0)
-    upper = np.minimum(lower + 1, size - 1)
-    return np.stack([lower, upper], axis=1), np.stack([1.0 - share, share], axis=1)
-
-
 def _checked(
     field: ReflectanceField, texels: ArrayLike, name: str, directions: ArrayLike
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

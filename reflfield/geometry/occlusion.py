@@ -18,10 +18,12 @@ from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.geometry.ray_scene import RayScene, row_strips
 from reflfield.geometry.texels import TexelTable
+from reflfield.util.image_boxes import bounding_box
 from reflfield.util.late_import import LateImport
 from reflfield.util.validation import check_ranges, check_shape
+from reflfield.util.vector_lengths import lengths
 
-ndimage: Any = LateImport("scipy.ndimage")
+cv2: Any = LateImport("cv2")
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -74,10 +76,15 @@ class VisibilityOptions:
         check_ranges(self, _RANGES)
 
 
-def lifted_positions(texels: TexelTable, scene: RayScene, options: VisibilityOptions) -> Array:
-    """Texel positions raised off the surface by the ray offset, (n, 3) float64."""
+def lifted_positions(
+    texels: TexelTable,
+    scene: RayScene,
+    options: VisibilityOptions,
+    rows: NDArray[np.intp] | slice = slice(None),
+) -> Array:
+    """Positions of texels, or some, raised off the surface by the ray offset, (n, 3)."""
     lift = options.ray_offset * scene.diagonal
-    return texels.position + lift * texels.face_normal
+    return texels.position[rows] + lift * texels.face_normal[rows]
 
 
 def view_visibility(
@@ -130,7 +137,7 @@ def view_visibility(
     visible &= _on_usable_pixel(texels, camera, usable)
     seen = np.flatnonzero(visible)
     if not _is_flat(scene):
-        starts = lifted_positions(texels.subset(seen), scene, options)
+        starts = lifted_positions(texels, scene, options, seen)
         visible[seen] = ~scene.occluded(
             starts, camera.view_directions(starts), _camera_distances(camera, starts)
         )
@@ -174,10 +181,15 @@ def _edges_of_rows(
     beside[:, :-1] |= across
     beside[1:] |= down.T
     beside[:-1] |= down.T
-    if not beside.any():
-        return beside
-    # The centres of the two pixels beside an edge are half a pixel away from it.
-    return np.asarray(ndimage.distance_transform_edt(~beside) + 0.5 <= options.edge_band)
+    near = np.zeros(depth.shape, dtype=bool)
+    if beside.any():
+        window = bounding_box(beside, math.ceil(options.edge_band))
+        away = cv2.distanceTransform(
+            (~beside[window]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+        )
+        # The centres of the two pixels beside an edge are half a pixel away from it.
+        near[window] = away + 0.5 <= options.edge_band
+    return near
 
 
 def light_visibility(
@@ -208,7 +220,7 @@ def light_visibility(
     if _is_flat(scene):
         return lit
     rows = np.flatnonzero(lit)
-    starts = lifted_positions(texels.subset(rows), scene, options)
+    starts = lifted_positions(texels, scene, options, rows)
     lit[rows] = ~scene.occluded(starts, light.directions(starts), light.distances(starts))
     return lit
 
@@ -257,8 +269,9 @@ def cameras_inside(scene: RayScene, cameras: Sequence[Camera]) -> tuple[str, ...
 def _faces_camera(texels: TexelTable, camera: Camera, options: VisibilityOptions) -> Bools:
     """True where the camera is in front of both the smooth and the real surface."""
     towards = camera.view_directions(texels.position)
-    cosine = (towards * texels.normal).sum(axis=1)
-    return (cosine >= options.grazing_cosine) & ((towards * texels.face_normal).sum(axis=1) > 0)
+    cosine = np.einsum("nd,nd->n", towards, texels.normal)
+    in_front = np.einsum("nd,nd->n", towards, texels.face_normal) > 0
+    return np.asarray((cosine >= options.grazing_cosine) & in_front)
 
 
 def _on_usable_pixel(texels: TexelTable, camera: Camera, usable: Bools) -> Bools:
@@ -273,14 +286,14 @@ def _on_usable_pixel(texels: TexelTable, camera: Camera, usable: Bools) -> Bools
 
 
 def _faces_light(texels: TexelTable, light: Light, options: VisibilityOptions) -> Bools:
-    cosine = (light.directions(texels.position) * texels.normal).sum(axis=1)
-    return cosine > options.light_cosine
+    cosine = np.einsum("nd,nd->n", light.directions(texels.position), texels.normal)
+    return np.asarray(cosine > options.light_cosine)
 
 
 def _camera_distances(camera: Camera, points: Array) -> Array:
     if camera.kind == "orthographic":
         return np.full(len(points), np.inf)
-    return np.linalg.norm(camera.centre - points, axis=1)
+    return lengths(camera.centre - points)
 
 
 def _footprint(camera: Camera, depth: Array) -> Array:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from reflfield.capture.cameras import Camera
 from reflfield.errors import GeometryError
 from reflfield.geometry.uv_atlas import Atlas
+from reflfield.util.image_boxes import bounding_box
 
 Array = NDArray[np.float64]
 
@@ -78,8 +79,8 @@ def _rectangle(
         raise GeometryError(
             f"silhouette of view {camera.id!r}: expected the object, received no pixel covered"
         )
-    rows, cols = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
-    return int(cols[0]), int(rows[0]), int(cols[-1]) + 1, int(rows[-1]) + 1
+    rows, cols = bounding_box(covered, margin=0)
+    return cols.start, rows.start, cols.stop, rows.stop
 
 
 def _faces_up(camera: Camera) -> bool:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reflfield.capture.cameras import Camera
+from reflfield.capture.cameras import OPENCV, ORTHOGRAPHIC, Camera
 from reflfield.errors import ShapeError
 from reflfield.geometry.mesh import Mesh, unit_or_zero
 from reflfield.geometry.open3d_library import open3d
+from reflfield.geometry.ray_kernels import draw_nearest, pack_rays
 from reflfield.options import available_cores
 from reflfield.util.validation import check_shape
 
@@ -131,7 +132,7 @@ class RayScene:
     def _camera_rays(self, camera: Camera, pixels: ArrayLike) -> tuple[Array, Array]:
         """Rays of pixels; parallel ones, which have no start, begin before the whole mesh."""
         origins, directions = camera.rays(pixels)
-        if camera.kind == "orthographic":
+        if camera.kind == ORTHOGRAPHIC:
             ahead = (self._origin - origins) @ camera.forward
             origins = origins + np.outer(ahead - self._scale, camera.forward)
         return origins, directions
@@ -170,15 +171,37 @@ class RayScene:
         rows, columns = self._window(camera)
         rows = range(max(rows.start, first), min(rows.stop, end))
         if rows and columns:
-            row, column = np.meshgrid(
-                np.array(rows) + 0.5, np.array(columns) + 0.5, indexing="ij"
-            )
-            pixels = np.stack([column.ravel(), row.ravel()], axis=1)
             inside = slice(rows.start - first, rows.stop - first)
-            depth[inside, columns.start : columns.stop] = self.pixel_depths(
-                camera, pixels
-            ).reshape(row.shape)
+            draws = self._is_drawn(camera)
+            of_window = self._drawn_depths if draws else self._traced_depths
+            depth[inside, columns.start : columns.stop] = of_window(camera, rows, columns)
         return depth
+
+    def _traced_depths(self, camera: Camera, rows: range, columns: range) -> Array:
+        row, column = np.meshgrid(np.array(rows) + 0.5, np.array(columns) + 0.5, indexing="ij")
+        pixels = np.stack([column.ravel(), row.ravel()], axis=1)
+        return self.pixel_depths(camera, pixels).reshape(row.shape)
+
+    def _is_drawn(self, camera: Camera) -> bool:
+        """Whether a camera's image is drawn triangle by triangle, which takes a straight lens.
+
+        All of the mesh must be before the camera.
+        """
+        return (
+            camera.kind == OPENCV and camera.keeps_lines_straight and self._all_before(camera)
+        )
+
+    def _drawn_depths(self, camera: Camera, rows: range, columns: range) -> Array:
+        """Depths of some rows and columns without rays."""
+        pixels, depth = camera.project(self.mesh.vertices)
+        corners = np.concatenate([pixels, 1.0 / depth[:, None]], axis=1)
+        nearness = np.zeros((len(rows), len(columns)))
+        draw_nearest(corners, self.mesh.faces, rows.start, columns.start, nearness)
+        down = (np.array(rows) + (0.5 - camera.cy)) / camera.fl_y
+        across = (np.array(columns) + (0.5 - camera.cx)) / camera.fl_x
+        slant = np.sqrt(1.0 + across**2 + down[:, None] ** 2)
+        shown = nearness > 0.0
+        return np.divide(slant, nearness, out=np.full(slant.shape, np.inf), where=shown)
 
     def _window(self, camera: Camera) -> tuple[range, range]:
         """Rows and columns of a camera's image that may show the mesh.
@@ -188,15 +211,20 @@ class RayScene:
         whole = range(camera.height), range(camera.width)
         if not camera.keeps_lines_straight:
             return whole
-        pixels, depth = camera.project(self.mesh.vertices)
-        if camera.kind != "orthographic" and not (depth > 0.0).all():
+        if camera.kind != ORTHOGRAPHIC and not self._all_before(camera):
             return whole
+        pixels, _ = camera.project(self.mesh.vertices)
         size = (camera.width, camera.height)
         # A pixel more, for rounding.
         low = np.clip(np.floor(pixels.min(axis=0)) - 1, 0, size).astype(int)
         high = np.clip(np.ceil(pixels.max(axis=0)) + 1, 0, size).astype(int)
         columns, rows = (range(*ends) for ends in zip(low.tolist(), high.tolist(), strict=True))
         return rows, columns
+
+    def _all_before(self, camera: Camera) -> bool:
+        """Whether all of the mesh is before a camera."""
+        ahead = (self.mesh.vertices - camera.centre) @ camera.forward
+        return bool((ahead > 0.0).all())
 
     def silhouette(self, camera: Camera) -> Bools:
         """True at the pixels of a camera whose centres show the mesh, (height, width)."""
@@ -222,17 +250,21 @@ class RayScene:
 
     def _rays_blocked(self, rays: NDArray[np.float32], lengths: NDArray[np.float32]) -> Bools:
         # Open3D takes one limit for all rays: the length of the direction carries ours.
-        unlimited = ~np.isfinite(lengths)
-        scaled = rays.copy()
-        scaled[:, 3:] *= np.where(unlimited, np.float32(1.0), lengths)[:, None]
-        blocked = np.zeros(len(rays), dtype=bool)
-        for rows, far in ((unlimited, np.inf), (~unlimited, 1.0)):
-            if rows.any():
-                answer = self._scene.test_occlusions(
-                    open3d.core.Tensor(scaled[rows]), 0.0, far, nthreads=self._threads
-                )
-                blocked[rows] = answer.numpy()
+        limited = np.isfinite(lengths)
+        if limited.all():
+            rays[:, 3:] *= lengths[:, None]
+            return self._blocked_within(rays, 1.0)
+        blocked = self._blocked_within(rays, np.inf)
+        if limited.any():
+            blocked[limited] = self._rays_blocked(rays[limited], lengths[limited])
         return blocked
+
+    def _blocked_within(self, rays: NDArray[np.float32], far: float) -> Bools:
+        """Whether something is hit before so many lengths of the rays' directions."""
+        answer = self._scene.test_occlusions(
+            open3d.core.Tensor(rays), 0.0, far, nthreads=self._threads
+        )
+        return np.array(answer.numpy())
 
     def _local(self, points: Array) -> NDArray[np.float32]:
         """World to scene coordinates: bounding box at the origin, diagonal 1."""
@@ -246,14 +278,13 @@ class RayScene:
         A start far from the mesh is moved up to two diagonals before its centre:
         single precision would otherwise lose the digits of the hit.
         """
-        start = np.asarray(origins, dtype=np.float64)
-        towards = np.asarray(directions, dtype=np.float64)
+        start = np.ascontiguousarray(origins, dtype=np.float64)
+        towards = np.ascontiguousarray(directions, dtype=np.float64)
         check_shape("origins", start, (None, 3))
         check_shape("directions", towards, start.shape)
-        ahead = ((self._origin - start) * towards).sum(axis=1)
-        skipped = np.maximum(ahead - 2.0 * self._scale, 0.0)
-        start = start + skipped[:, None] * towards
-        return np.concatenate([self._local(start), towards.astype(np.float32)], axis=1), skipped
+        rays, skipped = np.zeros((len(start), 6), np.float32), np.zeros(len(start))
+        pack_rays(start, towards, self._origin, self._scale, rays, skipped)
+        return rays, skipped
 
 
 def row_strips(camera: Camera) -> list[tuple[int, int]]:

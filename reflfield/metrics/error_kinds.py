@@ -29,7 +29,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from reflfield.capture.cameras import Camera
 from reflfield.capture.color_spaces import luminance
 from reflfield.capture.lights import DIRECTIONAL, POINT, SPOT, Light
-from reflfield.field.evaluation import texel_taps
+from reflfield.field.texel_taps import texel_taps
 from reflfield.geometry.mesh import unit_or_zero
 from reflfield.geometry.occlusion import VisibilityOptions, depth_edges
 from reflfield.metrics.image_errors import psnr_of_mean_square, strips

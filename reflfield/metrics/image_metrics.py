@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reflfield.errors import InputError, ShapeError
 from reflfield.metrics.image_errors import (
+    HALO_PX,
     PIXELS_PER_DEGREE,
     PSNR_CAP_DB,
     flip_map,
@@ -30,6 +31,7 @@ from reflfield.render.exposure import (
     display,
     object_pixels,
 )
+from reflfield.util.image_boxes import bounding_box
 
 Image = NDArray[np.float64]
 
@@ -367,6 +369,8 @@ def _sums(pair: ImagePair, counted: NDArray[np.bool_], exposure: float) -> dict[
     """Sums over the pixels that count: squared errors, SSIM, FLIP, and both images."""
     sums: dict[str, Any] = dict.fromkeys(("ldr", "hdr", "ssim", "flip"), 0.0)
     sums["colours"] = np.zeros((2, 3))
+    box = bounding_box(counted, HALO_PX)
+    pair, counted = _part_of(pair, box), counted[box]
     for own, wide, inner in strips(*counted.shape):
         here = counted[own]
         if not here.any():
@@ -388,11 +392,22 @@ def flip_errors(pair: ImagePair, exposure: float) -> NDArray[np.float32]:
     """FLIP error of each pixel, (h, w) float32; 0 where the object is not near."""
     covered = np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT
     errors = np.zeros(covered.shape, np.float32)
-    for own, wide, inner in strips(*covered.shape):
-        if covered[wide].any():
-            shown = [display(image, exposure) for image in without_backdrop(pair, wide)]
-            errors[own] = flip_map(*shown)[inner]
+    box = bounding_box(covered, HALO_PX)
+    pair, of_box = _part_of(pair, box), errors[box]
+    for own, wide, inner in strips(*of_box.shape):
+        shown = [display(image, exposure) for image in without_backdrop(pair, wide)]
+        of_box[own] = flip_map(*shown)[inner]
     return errors
+
+
+def _part_of(pair: ImagePair, box: tuple[slice, slice]) -> ImagePair:
+    """Some rows and columns of a pair; what is measured does not look beyond `HALO_PX`."""
+    images: dict[str, Any] = {
+        name: np.asarray(getattr(pair, name))[box]
+        for name in ("photograph", "relit", "silhouette")
+    }
+    excluded = None if pair.excluded is None else pair.excluded[box]
+    return replace(pair, excluded=excluded, **images)
 
 
 def check_pair(pair: ImagePair) -> None:

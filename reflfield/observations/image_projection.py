@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import SATURATED, with_bounded_black
+from reflfield.capture.directions import directions_towards
 from reflfield.capture.lights import Light
 from reflfield.observations.bilinear_sampling import Kinds, mark_kinds, sample_bilinear
 from reflfield.observations.photographed_pairs import PhotographedPairs
@@ -411,10 +412,9 @@ def directions_of(
         Of an unknown light, world +Z: its direction does not enter.
     """
     points = np.asarray(positions, np.float64)
-    views = np.zeros((len(points), capture.n_views, 3), np.float32)
-    lights = np.zeros((len(points), capture.n_lights, 3), np.float32)
-    for i, camera in enumerate(capture.cameras):
-        views[:, i] = camera.view_directions(points)
-    for j, light in enumerate(capture.lights):
-        lights[:, j] = light.directions(points)
-    return views, lights
+    cameras = [camera.whereabouts for camera in capture.cameras]
+    lights = [light.whereabouts for light in capture.lights]
+    return (
+        directions_towards(points, cameras, np.float32),
+        directions_towards(points, lights, np.float32),
+    )

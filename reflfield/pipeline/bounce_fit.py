@@ -17,6 +17,7 @@ from reflfield.pipeline.indirect import fitted_to_shade
 from reflfield.render.bounced_light import BouncedLight
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.blas_threads import thread_pool
+from reflfield.util.even_order import even_order
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -25,7 +26,7 @@ Indices = NDArray[np.intp]
 # other it is about 1; where a simulation left that out it was below .1, and about .3 under a
 # flash whose stray light fills the shadows.
 LEAST_GAIN = 0.4
-# Lights under which the gain is tried first.
+# Lights under which the gain is looked at first; then under twice as many, and so on.
 LIGHTS_TRIED = 16
 # Largest gain: noise and light of the surroundings are not the surface's own.
 LARGEST_GAIN = 1.5
@@ -59,14 +60,7 @@ def with_bounced_light(
     traced = BouncedLight(FieldSurface(field), context.resources.workers)
     if not traced.shares.nnz:
         return indirect
-    lights, power = np.unique(shade.light[shade.weights.any(axis=2)]), field.inverse_power
-    few = lights[np.linspace(0, len(lights) - 1, min(len(lights), LIGHTS_TRIED)).astype(int)]
-    bounced = _of_shade(context, traced, shade, few) ** np.float32(1 / power)
-    if (_gain(shade, bounced, few) < LEAST_GAIN).all():
-        return indirect
-    bounced = _of_shade(context, traced, shade, lights) ** np.float32(1 / power)
-    gain = _gain(shade, bounced, lights)
-    # Of few lights it may have come out larger.
+    bounced, gain = _as_shown(context, field, traced, shade)
     if (gain < LEAST_GAIN).all():
         return indirect
 
@@ -85,13 +79,36 @@ def gain_counts(field: ReflectanceField) -> dict[str, list[float]]:
     return {"gain of bounced light": field.indirect.gain.astype(float).round(3).tolist()}
 
 
-def _of_shade(
-    context: Context, traced: BouncedLight, shade: StoredShade, numbers: Indices
-) -> Floats:
-    """Bounced light of some lights as samples where a shade has its own, (n, n_kept, 3)."""
-    lit = results.light_visible(context)
-    bounced = np.zeros(shade.values.shape, np.float32)
-    lights = context.training.lights
+def _as_shown(
+    context: Context, field: ReflectanceField, traced: BouncedLight, shade: StoredShade
+) -> tuple[Floats, Floats]:
+    """Bounced light where a shade has samples, (n, n_kept, 3), and its gain.
+
+    More and more lights are looked at, until their gain is too small, or all are done.
+    """
+    lights = np.unique(shade.light[shade.weights.any(axis=2)])
+    lights = lights[even_order(len(lights))]
+    bounced, gain = np.zeros(shade.values.shape, np.float32), np.zeros(3, np.float32)
+    transformed, n_done, n_next = bounced, 0, LIGHTS_TRIED
+    while n_done < len(lights):
+        _add_bounced(context, traced, shade, lights[n_done:n_next], bounced)
+        n_done, n_next = n_next, 2 * n_next
+        transformed = bounced ** np.float32(1 / field.inverse_power)
+        gain = _gain(shade, transformed, lights[:n_done])
+        if (gain < LEAST_GAIN).all():
+            break
+    return transformed, gain
+
+
+def _add_bounced(
+    context: Context,
+    traced: BouncedLight,
+    shade: StoredShade,
+    numbers: Indices,
+    bounced: Floats,
+) -> None:
+    """Add what some lights bring to the bounced light (n, n_kept, 3) of a shade."""
+    lit, lights = results.light_visible(context), context.training.lights
     _ = (traced.shares, traced.albedo)
 
     def under(number: int) -> tuple[Indices, Indices, Floats]:
@@ -101,7 +118,6 @@ def _of_shade(
     with thread_pool(traced.workers) as pool:
         for row, place, values in pool.map(under, numbers.tolist()):
             bounced[row, place] = values
-    return bounced
 
 
 def _gain(shade: StoredShade, bounced: Floats, lights: Indices) -> Floats:

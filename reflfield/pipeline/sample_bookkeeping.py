@@ -27,8 +27,11 @@ def sample_counts(context: Context) -> Iterator[CountedItems]:
     CountedItems
     """
     counts = {record.name: record.counts for record in context.stages.records}
-    yield _photographs(context, counts["observations"])
-    yield _values(context, counts["observations"])
+    # Of the surface that the field is on.
+    context = context.refined
+    projected = counts[context.stage_of("observations")]
+    yield _photographs(context, projected)
+    yield _values(context, projected)
     yield _samples(context, counts)
     yield from _texels(context, counts)
     yield _frames(context)
@@ -59,7 +62,8 @@ def _samples(context: Context, counts: dict[str, dict[str, Any]]) -> CountedItem
     handed_on = counts.get("completion", {}).get("samples observed", n_observed)
     used = counts["compression"]["samples fitted"]
     unmeasured = counts["compression"]["samples not measured"]
-    shade = counts.get("indirect", {"samples in shadow": 0, "samples at edges of shadows": 0})
+    none = {"samples in shadow": 0, "samples at edges of shadows": 0}
+    shade = counts.get(context.stage_of("indirect"), none)
     mixed = shade["samples at edges of shadows"]
     shown = shade["samples in shadow"] - mixed
     return CountedItems(

@@ -152,19 +152,19 @@ MODEL_SELECTION = Stage(
     reads=stage_inputs.selection_digests,
     wanted=model_selection.has_candidates,
 )
-# samples in shadow -> interreflection and other indirect light
+# samples in shadow -> interreflection and other indirect light, where the hull stays as it is
 INDIRECT = Stage(
     "indirect",
     indirect.write_indirect,
     after=(OBSERVATIONS,),
     options=lambda options: (options.indirect, options.resampling, options.seed),
-    wanted=lambda context: context.fits_indirect_light,
+    wanted=lambda context: context.fits_indirect_light and not context.options.refines_surface,
 )
 # fit on the hull; the hull moved to the normals that were fitted
 SURFACE = Stage(
     "surface",
     surface.write_surface,
-    after=(OBSERVATIONS, LEFT_OUT_VIEWS, INDIRECT),
+    after=(OBSERVATIONS, LEFT_OUT_VIEWS),
     options=lambda options: (options.compression, options.resampling, options.seed),
     wanted=lambda context: context.options.refines_surface,
 )

@@ -29,7 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reflfield.capture.lights import Light
-from reflfield.field.evaluation import evaluate, texel_taps
+from reflfield.field.evaluation import evaluate
+from reflfield.field.texel_taps import texel_taps
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.blas_threads import thread_pool
 from reflfield.util.late_import import LateImport

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.cameras import ORTHOGRAPHIC, Camera
-from reflfield.field.evaluation import texel_taps
 from reflfield.field.reflectance_field import ReflectanceField
+from reflfield.field.texel_taps import texel_taps
 from reflfield.geometry.mesh import Mesh
 from reflfield.geometry.occlusion import VisibilityOptions
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.geometry.texels import TexelTable, texel_table
 from reflfield.geometry.uv_atlas import Atlas
+from reflfield.render.footprints import Footprints, blended, merged_taps
 from reflfield.util.late_import import LateImport
 
 spatial: Any = LateImport("scipy.spatial")
@@ -49,39 +49,6 @@ class SurfaceHits:
     front: Bools
 
 
-@dataclass(frozen=True, eq=False)
-class Footprints:
-    """The texels under each pixel: one entry for each pair of pixel and texel.
-
-    Parameters
-    ----------
-    pixel : (n,) int64
-        Pixel of the entry, counted within the block.
-    texel : (n,) int32
-        Its texel.
-    position : (n, 3) float64
-        Mean of the pixel's hits that read the texel.
-    entry_of_tap : (n_hits, 4) int64
-        Entry that each tap of each hit went to, -1 for taps without weight.
-    weights : (n_hits, 4) float32
-        Weights of the taps.
-    """
-
-    pixel: NDArray[np.int64]
-    texel: NDArray[np.int32]
-    position: Array
-    entry_of_tap: NDArray[np.int64]
-    weights: NDArray[np.float32]
-
-    def summed(self, per_hit: NDArray[Any]) -> Array:
-        """Sum a number per hit into the entries, weighted by the taps, (n,) float64."""
-        values = self.weights * per_hit[:, None]
-        used = self.entry_of_tap >= 0
-        return np.bincount(
-            self.entry_of_tap[used], values[used], minlength=len(self.pixel)
-        ).astype(np.float64)
-
-
 class FieldSurface:
     """The base mesh of a field, ready for rays.
 
@@ -109,6 +76,7 @@ class FieldSurface:
         self.scene = RayScene(self.mesh, threads)
         share = VisibilityOptions().ray_offset if ray_offset is None else ray_offset
         self.lift = share * self.scene.diagonal
+        self._uv = np.asarray(field.uv, np.float64)
 
     def first_hits(self, origins: Array, directions: Array) -> SurfaceHits:
         """Meet the surface.
@@ -130,9 +98,9 @@ class FieldSurface:
         corners = self.mesh.faces[face]
         return SurfaceHits(
             ray=ray,
-            position=np.einsum("nk,nkd->nd", barycentric, self.mesh.vertices[corners]),
+            position=blended(self.mesh.vertices, corners, barycentric),
             face_normal=normal,
-            uv=np.einsum("nk,nkd->nd", barycentric, self.field.uv[corners]),
+            uv=blended(self._uv, corners, barycentric),
             front=np.einsum("nd,nd->n", normal, directions[ray]) < 0,
         )
 
@@ -189,17 +157,7 @@ class FieldSurface:
         """
         texels, weights = texel_taps(self.field, hits.uv, transition)
         weights *= hits.front[:, None]
-        entry = np.full(texels.shape, -1, np.int64)
-        entry_pixel = np.zeros(texels.size, np.int64)
-        entry_texel = np.zeros(texels.size, np.int32)
-        n = _merge_taps(pixel, texels, weights, entry, entry_pixel, entry_texel)
-        merged = Footprints(
-            entry_pixel[:n].copy(), entry_texel[:n].copy(), np.zeros((n, 3)), entry, weights
-        )
-        total = merged.summed(np.ones(len(pixel)))
-        for axis in range(3):
-            merged.position[:, axis] = merged.summed(hits.position[:, axis]) / total
-        return merged
+        return merged_taps(pixel, texels, weights, hits.position)
 
     def reached_by_light(
         self,
@@ -307,37 +265,6 @@ def subpixel_offsets(samples_per_pixel: int) -> Array:
     axis = (np.arange(side) + 0.5) / side
     y, x = np.meshgrid(axis, axis, indexing="ij")
     return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-@numba.njit(cache=True, nogil=True)
-def _merge_taps(
-    pixel: NDArray[np.int64],
-    texels: NDArray[np.int32],
-    weights: NDArray[np.float32],
-    entry: NDArray[np.int64],
-    entry_pixel: NDArray[np.int64],
-    entry_texel: NDArray[np.int32],
-) -> int:
-    """Number the distinct texels of each pixel; returns their count."""
-    n = 0
-    first = 0  # first entry of the current pixel
-    for i in range(len(pixel)):
-        if i > 0 and pixel[i] != pixel[i - 1]:
-            first = n
-        for j in range(4):
-            if not weights[i, j] > 0:
-                continue
-            # The latest entries are the likeliest: neighbouring samples share texels.
-            same = n - 1
-            while same >= first and entry_texel[same] != texels[i, j]:
-                same -= 1
-            if same < first:
-                same = n
-                entry_pixel[n] = pixel[i]
-                entry_texel[n] = texels[i, j]
-                n += 1
-            entry[i, j] = same
-    return n
 
 
 def _nearest_rows(

@@ -27,13 +27,13 @@ from reflfield.options import MOST_WORKERS, available_cores
 from reflfield.render.bounced_light import BouncedLight
 from reflfield.render.camera_rays import (
     FieldSurface,
-    Footprints,
     SurfaceHits,
     pixel_window,
     subpixel_offsets,
 )
 from reflfield.render.distant_lights import DistantLights
 from reflfield.render.environment_map import EnvironmentMap
+from reflfield.render.footprints import Footprints
 from reflfield.util.blas_threads import thread_pool
 from reflfield.util.validation import check_ranges
 

@@ -8,8 +8,8 @@ from reflfield.field.evaluation import (
     evaluate,
     light_response,
     sum_lights,
-    texel_taps,
 )
+from reflfield.field.texel_taps import texel_taps
 from reflfield.sphere.hemisphere import (
     HORIZON_SOFTNESS,
     HemisphereGrid,

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -270,7 +271,7 @@ def test_edges_do_not_depend_on_the_strips_that_they_are_found_in(monkeypatch):
         ("orthographic", (), [0.3, -0.2, 4.0]),
     ],
 )
-def test_pixels_that_cannot_show_the_mesh_are_not_traced_and_miss_nothing(
+def test_pixels_that_cannot_show_the_mesh_are_not_looked_at_and_miss_nothing(
     kind, distortion, moved
 ):
     sphere = trimesh.creation.icosphere(2)
@@ -281,8 +282,11 @@ def test_pixels_that_cannot_show_the_mesh_are_not_traced_and_miss_nothing(
     camera = Camera("v", kind, 40, 33, focal, focal, 20.0, 16.5, pose, distortion)
     y, x = np.mgrid[:33, :40] + 0.5
     everywhere = scene.pixel_depths(camera, np.stack([x.ravel(), y.ravel()], axis=1))
-    assert np.array_equal(scene.row_depths(camera, 0, 33), everywhere.reshape(33, 40))
-    assert np.array_equal(scene.row_depths(camera, 7, 12), everywhere.reshape(33, 40)[7:12])
+    everywhere = everywhere.reshape(33, 40)
+    # Some are drawn, not traced; rays have single precision.
+    assert_depths = partial(np.testing.assert_allclose, rtol=64 * np.finfo(np.float32).eps)
+    assert_depths(scene.row_depths(camera, 0, 33), everywhere)
+    assert_depths(scene.row_depths(camera, 7, 12), everywhere[7:12])
 
 
 def test_threads_of_a_query_are_no_more_than_cores():

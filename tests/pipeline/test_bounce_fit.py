@@ -12,6 +12,7 @@ from reflfield.observations.stored_shade import StoredShade
 from reflfield.pipeline import bounce_fit, results
 from reflfield.pipeline.bounce_fit import LEAST_GAIN, with_bounced_light
 from reflfield.pipeline.pipeline_options import IndirectOptions
+from reflfield.render.bounced_light import BouncedLight
 from tests.render.test_bounced_light import SIDE, bounced_light, corner_surface, field_of
 
 N_LIGHTS = 12
@@ -96,13 +97,38 @@ def test_harmonics_stay_alone_where_shadows_show_no_bounced_light(corner, rest):
 
 
 def test_gain_that_only_few_lights_show_counts_as_none(corner, monkeypatch):
-    """As under a flash, whose stray light is in the shadows."""
-    context, field, _ = corner(1.0, rest=0.0)
+    """As under a flash, whose stray light is in the shadows; no further light is traced."""
+    context, field, shade = corner(1.0, rest=0.0)
+    n_shown = len(np.unique(shade.light[shade.weights.any(axis=2)]))
+    assert n_shown > 6
     before = harmonics(field.n_texels)
     gains = iter([np.full(3, 2 * LEAST_GAIN), np.full(3, 0.9 * LEAST_GAIN)])
-    monkeypatch.setattr(bounce_fit, "_gain", lambda *_: next(gains))
+    asked, traced = [], []
+    under = BouncedLight.under
+
+    def counted(self, light, lit=None):
+        traced.append(light.id)
+        return under(self, light, lit)
+
+    def gain(shade, bounced, lights):
+        asked.append(len(lights))
+        return next(gains)
+
+    monkeypatch.setattr(bounce_fit, "LIGHTS_TRIED", 3)
+    monkeypatch.setattr(bounce_fit, "_gain", gain)
+    monkeypatch.setattr(BouncedLight, "under", counted)
     assert with_bounced_light(context, field, before) is before
-    assert not list(gains)
+    assert asked == [3, 6]
+    assert len(traced) == len(set(traced)) == 6
+
+
+def test_lights_looked_at_in_rounds_give_the_gain_of_all(corner, monkeypatch):
+    context, field, _ = corner(np.array([1.0, 0.8, 0.6]), rest=0.002, noise=1e-4)
+    whole = with_bounced_light(context, field, harmonics(field.n_texels))
+    monkeypatch.setattr(bounce_fit, "LIGHTS_TRIED", 2)
+    rounds = with_bounced_light(context, field, harmonics(field.n_texels))
+    np.testing.assert_array_equal(rounds.gain, whole.gain)
+    np.testing.assert_array_equal(rounds.coefficients, whole.coefficients)
 
 
 def test_without_shadows_or_not_asked_for_nothing_changes(corner, monkeypatch):

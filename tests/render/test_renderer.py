@@ -9,8 +9,9 @@ from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.lights import Light
 from reflfield.errors import InputError
 from reflfield.field.build import FittedReflectance, build_field
-from reflfield.field.evaluation import evaluate, texel_taps
+from reflfield.field.evaluation import evaluate
 from reflfield.field.indirect_light import IndirectLight
+from reflfield.field.texel_taps import texel_taps
 from reflfield.geometry.ray_scene import RayScene
 from reflfield.render.camera_rays import pixel_window
 from reflfield.render.renderer import Renderer, RenderOptions, render

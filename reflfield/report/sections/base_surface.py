@@ -22,6 +22,7 @@ from reflfield.report.page import (
     Table,
     encode_picture,
 )
+from reflfield.util.image_boxes import bounding_box
 
 SHEET_PX = 360
 ATLAS_PX = 720
@@ -147,7 +148,7 @@ def _exposure_of(image: NDArray[Any], shown: NDArray[np.bool_]) -> float:
 def _overlay(view: SilhouetteView) -> Picture:
     covered = _covered(view.silhouette)
     hull = _covered(view.hull_silhouette)
-    box = pictures.bounding_box(covered | hull, margin=8)
+    box = bounding_box(covered | hull, margin=8)
     photograph, seen = np.asarray(view.photograph)[box], covered[box]
     exposure = _exposure_of(photograph, seen)
     # Outlines are one pixel wide; on small photographs that would hide the gaps.

@@ -27,6 +27,7 @@ from reflfield.report.page import (
     encode_picture,
 )
 from reflfield.report.sections.held_out_images import METRIC_HEADER, ROW_PX, metric_cells
+from reflfield.util.image_boxes import bounding_box
 
 BASELINE_NAMES: Mapping[str, str] = {
     NEAREST: "nearest photograph",
@@ -278,7 +279,7 @@ def kinds_coloured(kinds: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _box(pair: ImagePair) -> tuple[slice, slice]:
-    return pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
+    return bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
 
 
 def _picture(image: NDArray[Any], box: tuple[slice, slice], exposure: float) -> Picture:

@@ -31,6 +31,7 @@ from reflfield.report.page import (
     Table,
     encode_picture,
 )
+from reflfield.util.image_boxes import bounding_box
 
 ROW_PX = 480
 # FLIP errors of good results lie near 0; full scale would show black images.
@@ -105,7 +106,7 @@ class ComparedRow:
 
 def compared_row(pair: ImagePair, metrics: ImageMetrics, exposure: float) -> ComparedRow:
     """Crop photograph and image to the object and compute their FLIP errors."""
-    box = pictures.bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
+    box = bounding_box(np.asarray(pair.silhouette) >= COVERAGE_OF_OBJECT, margin=6)
     photograph, relit = (
         encode_picture(pictures.fitted(encoded_picture(image[box], exposure), ROW_PX))
         for image in (np.asarray(pair.photograph), np.asarray(pair.relit))

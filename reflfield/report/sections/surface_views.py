@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from reflfield.render.exposure import ExposureMeter, encoded_picture
 from reflfield.report import pictures
 from reflfield.report.page import Figure, Panel, Section, encode_picture
+from reflfield.util.image_boxes import bounding_box
 
 SHEET_PX = 360
 
@@ -59,7 +60,7 @@ def surface_section(views: Iterable[SurfaceView]) -> Section:
 
 
 def _panels(view: SurfaceView) -> tuple[Panel, ...]:
-    box = pictures.bounding_box(np.isfinite(view.hull), margin=4)
+    box = bounding_box(np.isfinite(view.hull), margin=4)
     photograph, shown = np.asarray(view.photograph)[box], np.isfinite(view.hull)[box]
     meter = ExposureMeter()
     meter.add(photograph, shown)
