@@ -12,6 +12,7 @@ from reflfield.capture.cameras import ORTHOGRAPHIC
 from reflfield.errors import GeometryError
 from reflfield.geometry.carving import refuse_empty
 from reflfield.geometry.cones import View, normalised
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.quoting import listed
 
 Array = NDArray[np.float64]
@@ -44,14 +45,16 @@ def object_bounds(views: Sequence[View], tolerance: int) -> tuple[Array, Array]:
     return origin + scale * low, origin + scale * high
 
 
-def robust_bounds(views: Sequence[View]) -> tuple[Array, Array] | None:
+def robust_bounds(views: Sequence[View], workers: int = 1) -> tuple[Array, Array] | None:
     """Box around the object though a few views may be wrong; None if there is none.
 
     The boxes of several groups of views, and of all views but one group, are joined: at
-    least one of them knows no wrong view, if these are few.
+    least one of them knows no wrong view, if these are few. `workers` are threads.
     """
     origin, scale = _whereabouts(views)
-    boxes = [box for some in _subsets(views) if (box := _box_if_any(some, origin, scale))]
+    with thread_pool(workers) as pool:
+        found = pool.map(lambda some: _box_if_any(some, origin, scale), _subsets(views))
+        boxes = [box for box in found if box]
     sizes = [float(np.max(high - low)) for low, high in boxes]
     if not sizes or not max(sizes) > 0.0:
         return None

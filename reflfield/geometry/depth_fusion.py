@@ -24,6 +24,7 @@ from scipy.ndimage import gaussian_filter, minimum_filter
 from reflfield.geometry.carving import FARTHEST, Grid
 from reflfield.geometry.light_stack import projection_matrix
 from reflfield.geometry.patch_stereo import SeenSurface
+from reflfield.util.blas_threads import thread_pool
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -55,7 +56,9 @@ class _DepthMaps(NamedTuple):
     axes: Array
 
 
-def carved_by_depths(volume: Floats, grid: Grid, seen: Sequence[SeenSurface]) -> Floats:
+def carved_by_depths(
+    volume: Floats, grid: Grid, seen: Sequence[SeenSurface], workers: int = 1
+) -> Floats:
     """Signed distances, in voxels, of what views leave of a body, at most `BAND`.
 
     Parameters
@@ -65,6 +68,8 @@ def carved_by_depths(volume: Floats, grid: Grid, seen: Sequence[SeenSurface]) ->
     grid : Grid
     seen : sequence of SeenSurface
         Surfaces inside of it.
+    workers : int
+        Threads.
 
     Returns
     -------
@@ -73,12 +78,16 @@ def carved_by_depths(volume: Floats, grid: Grid, seen: Sequence[SeenSurface]) ->
     """
     maps = _depth_maps(seen)
     total, weight = np.zeros((2, *volume.shape), np.float32)
-    for first in range(0, len(volume), SLICES_AT_ONCE):
+
+    def vote(first: int) -> None:
         some = volume[first : first + SLICES_AT_ONCE]
         corners = np.argwhere(some > -FARTHEST)
         points = grid.origin + (corners + np.array([first, 0, 0])) * grid.spacing
         at = (corners[:, 0] + first, corners[:, 1], corners[:, 2])
         total[at], weight[at] = _votes(points, maps, BAND * grid.spacing)
+
+    with thread_pool(workers) as pool:
+        list(pool.map(vote, range(0, len(volume), SLICES_AT_ONCE)))
     sums, weights = (gaussian_filter(field, BLUR, mode="nearest") for field in (total, weight))
     before = np.where(weights > LEAST_WEIGHT, sums / np.maximum(weights, LEAST_WEIGHT), -1.0)
     return np.minimum(volume, -BAND * before).astype(np.float32)

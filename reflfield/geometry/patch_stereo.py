@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -148,8 +149,10 @@ class PatchStereo:
 
         with thread_pool(self.n_threads) as pool:
             seen = list(track(pool.map(one, self.chosen), len(self.chosen), words))
-        among = towards[list(self.chosen)]
-        return [_confirmed(seen, i, neighbours(among, i)) for i in range(len(seen))]
+            among = towards[list(self.chosen)]
+            confirmed = partial(_confirmed, seen)
+            numbers = range(len(seen))
+            return list(pool.map(confirmed, numbers, (neighbours(among, i) for i in numbers)))
 
     def costs(self, surface: RayScene) -> list[tuple[Array, Floats]]:
         """Depth of a surface in each chosen view, (h, w), NaN off it, and costs there."""

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from reflfield.errors import GeometryError
 from reflfield.geometry.bounding_box import robust_bounds
 from reflfield.geometry.cones import View
-from reflfield.geometry.contradictions import best_on_rays, best_score, votes_of
+from reflfield.geometry.contradictions import Votes, best_on_rays, best_score, votes_of
 from reflfield.geometry.silhouette_distance import signed_distance
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.quoting import listed
 
 Array = NDArray[np.float64]
@@ -84,42 +85,57 @@ def without_specks(
     -----
     Where no silhouette has small parts, nothing is computed.
     """
-    small = [_small_parts(view) for view in views]
-    if not any(parts.count for parts in small):
-        return list(views), silhouettes, {}
+    with thread_pool(workers) as pool:
+        small = list(pool.map(_small_parts, views))
+    marked = [number for number, parts in enumerate(small) if parts.count]
+    kept_views, clean = list(views), Cleaned(silhouettes)
     inner = [
         _without_rim(view, parts) if parts.count else view
         for view, parts in zip(views, small, strict=True)
     ]
-    box = robust_bounds(inner)
+    box = robust_bounds(inner, workers) if marked else None
     if box is None:
-        return list(views), silhouettes, {}
+        return kept_views, silhouettes, {}
     votes = votes_of(inner, *box, workers)
-    kept_views, clean, removed = list(views), Cleaned(silhouettes), dict[str, int]()
-    for number, parts in enumerate(small):
-        if not parts.count:
-            continue
-        others = [i for i in range(len(views)) if i != number]
-        score = best_score(votes, votes.of(others))
-        row, col = np.divmod(parts.pixels, views[number].camera.width)
-        pixels: Array = np.stack([col, row], axis=1).astype(np.float64) + 0.5
-        best = best_on_rays(views[number], pixels, votes, score)
-        supported = (best >= 0) & (score[best] < 0.5)
-        lost = np.ones(parts.count + 1, dtype=bool)
-        lost[np.unique(parts.number[supported])] = False
-        lost[0] = False
+
+    def cleaned(number: int) -> int:
+        """Number of parts of a view that are removed."""
+        lost = _unsupported(views[number], small[number], votes, number, len(views))
         if lost.any():
-            name = views[number].camera.id
-            removed[name] = int(lost.sum())
-            camera = views[number].camera
-            gone = np.zeros((camera.height, camera.width), dtype=bool)
-            gone.ravel()[parts.pixels[lost[parts.number]]] = True
-            clean.removed[number] = np.flatnonzero(_with_fringe(gone))
-            outline = signed_distance(clean[number], f"silhouette of view {name!r}")
+            clean.removed[number] = _pixels_of(views[number], small[number], lost)
+            name = f"silhouette of view {views[number].camera.id!r}"
+            outline = signed_distance(clean[number], name)
             if scratch is not None:
                 outline = outline.moved_to(scratch / f"distances{number}.npy")
             kept_views[number] = replace(views[number], outline=outline)
+        return int(lost.sum())
+
+    with thread_pool(workers) as pool:
+        counts = dict(zip(marked, pool.map(cleaned, marked), strict=True))
+    removed = {views[number].camera.id: count for number, count in counts.items() if count}
     return kept_views, clean, removed
+
+
+def _unsupported(
+    view: View, parts: _SmallParts, votes: Votes, number: int, n_views: int
+) -> NDArray[np.bool_]:
+    """True (n_parts + 1,) for the parts of a view that the other views exclude."""
+    score = best_score(votes, votes.of([i for i in range(n_views) if i != number]))
+    row, col = np.divmod(parts.pixels, view.camera.width)
+    pixels: Array = np.stack([col, row], axis=1).astype(np.float64) + 0.5
+    best = best_on_rays(view, pixels, votes, score)
+    supported = (best >= 0) & (score[best] < 0.5)
+    lost = np.ones(parts.count + 1, dtype=bool)
+    lost[np.unique(parts.number[supported])] = False
+    lost[0] = False
+    return lost
+
+
+def _pixels_of(view: View, parts: _SmallParts, lost: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Pixels, row by row, of some parts of a silhouette, and those beside them."""
+    gone = np.zeros((view.camera.height, view.camera.width), dtype=bool)
+    gone.ravel()[parts.pixels[lost[parts.number]]] = True
+    return np.flatnonzero(_with_fringe(gone))
 
 
 def specks_words(removed: Mapping[str, int]) -> tuple[str, ...]:

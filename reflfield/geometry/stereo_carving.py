@@ -78,7 +78,7 @@ def carved_by_stereo(
     for number in range(ROUNDS):
         around = None if mesh is None else RayScene(mesh)
         seen = stereo.depths(around, f"stereo, round {number + 1} of {ROUNDS}")
-        left = carved_by_depths(volume, grid, seen)
+        left = carved_by_depths(volume, grid, seen, n_threads)
         try:
             last = number == ROUNDS - 1
             mesh = closed_surface(left, grid, options if last else fine, outlines)
