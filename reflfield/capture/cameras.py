@@ -15,15 +15,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture import lenses
-from reflfield.capture.directions import Whereabouts, directions_towards, kernels
+from reflfield.capture.directions import Whereabouts, directions_towards
 from reflfield.errors import CaptureError
+from reflfield.util.late_import import LateImport
 from reflfield.util.validation import check_shape
 from reflfield.util.vector_lengths import lengths
+
+if TYPE_CHECKING:
+    from reflfield.capture import point_kernels as kernels
+else:
+    kernels = LateImport("reflfield.capture.point_kernels")
 
 Array = NDArray[np.float64]
 
@@ -267,15 +274,8 @@ class Camera:
 
     def view_directions(self, points: ArrayLike) -> Array:
         """Unit directions (n, 3) from world points (n, 3) towards the camera."""
-        directions: Array = directions_towards(_points(points), [self.whereabouts])[:, 0]
+        directions: Array = directions_towards(_points(points), [place_of_camera(self)])[:, 0]
         return directions
-
-    @property
-    def whereabouts(self) -> Whereabouts:
-        """The camera's centre; of an orthographic one the direction towards it."""
-        if self.kind == ORTHOGRAPHIC:
-            return Whereabouts(-self.forward, is_point=False)
-        return Whereabouts(self.centre, is_point=True)
 
     def contains(self, pixels: ArrayLike) -> NDArray[np.bool_]:
         """Whether pixel coordinates (n, 2) lie in the image; (n,) bool, False for NaN.
@@ -310,6 +310,13 @@ class Camera:
             return lenses.distort_fisheye(ideal, self.distortion)
         with np.errstate(over="ignore", invalid="ignore"):
             return lenses.distort(ideal, self.distortion)
+
+
+def place_of_camera(camera: Camera) -> Whereabouts:
+    """The camera's centre; of an orthographic one the direction towards it."""
+    if camera.kind == ORTHOGRAPHIC:
+        return Whereabouts(-camera.forward, is_point=False)
+    return Whereabouts(camera.centre, is_point=True)
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:

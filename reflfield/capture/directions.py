@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from reflfield.util.late_import import LateImport
 
-kernels: Any = LateImport("reflfield.capture.point_kernels")
+if TYPE_CHECKING:
+    from reflfield.capture import point_kernels as kernels
+else:
+    kernels = LateImport("reflfield.capture.point_kernels")
 
 # Of a point that is where the camera is: its direction comes out as zero.
 LEAST_DISTANCE = np.finfo(np.float64).tiny

@@ -166,23 +166,10 @@ class Light:
         InputError
             For an environment or a group, which have no single direction.
         """
-        directions: Array = directions_towards(self._points(points), [self.whereabouts])[:, 0]
+        directions: Array = directions_towards(self._points(points), [place_of_light(self)])[
+            :, 0
+        ]
         return directions
-
-    @property
-    def whereabouts(self) -> Whereabouts:
-        """Where the light is; +Z of the world for one that is unknown.
-
-        Raises
-        ------
-        InputError
-            For an environment or a group, which are at no single place.
-        """
-        self._check_single()
-        if self.kind in (POINT, SPOT):
-            return Whereabouts(self.position, is_point=True)
-        towards = np.array([0.0, 0.0, 1.0]) if self.kind == UNKNOWN else self.direction
-        return Whereabouts(towards, is_point=False)
 
     def distances(self, points: ArrayLike) -> Array:
         """Distances (n,) from world points (n, 3), metres; inf for far lights."""
@@ -215,15 +202,8 @@ class Light:
             return np.asarray(self.irradiance(points).any(axis=1))
         return np.full(len(self._points(points)), self.shines)
 
-    def _check_single(self) -> None:
-        if self.kind in (ENVIRONMENT, GROUP):
-            raise InputError(
-                f"light {self.id!r}: expected a single light, received kind {self.kind!r}, "
-                "which has no single direction or irradiance; sum over its map or its members"
-            )
-
     def _points(self, points: ArrayLike) -> Array:
-        self._check_single()
+        check_single(self)
         world = np.asarray(points, dtype=np.float64)
         check_shape("points", world, (None, 3))
         return world
@@ -242,6 +222,36 @@ class Light:
         if self.exponent == 0:
             return smooth
         return smooth * np.maximum(cosine, 0.0) ** self.exponent
+
+
+def check_single(light: Light) -> None:
+    """Refuse an environment and a group.
+
+    Raises
+    ------
+    InputError
+        Naming the light.
+    """
+    if light.kind in (ENVIRONMENT, GROUP):
+        raise InputError(
+            f"light {light.id!r}: expected a single light, received kind {light.kind!r}, "
+            "which has no single direction or irradiance; sum over its map or its members"
+        )
+
+
+def place_of_light(light: Light) -> Whereabouts:
+    """Where a light is; +Z of the world for one that is unknown.
+
+    Raises
+    ------
+    InputError
+        For an environment or a group, which are at no single place.
+    """
+    check_single(light)
+    if light.kind in (POINT, SPOT):
+        return Whereabouts(light.position, is_point=True)
+    towards = np.array([0.0, 0.0, 1.0]) if light.kind == UNKNOWN else light.direction
+    return Whereabouts(towards, is_point=False)
 
 
 class PointLight(Light):

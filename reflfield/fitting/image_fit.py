@@ -39,6 +39,8 @@ Array = NDArray[np.float64]
 Allocate = Callable[[tuple[int, ...]], Floats]
 
 ITERATIONS = 14
+# Ranges of texels whose sums are taken side by side.
+TEXEL_RANGES = 8
 # Largest tilt of a normal and turn about it of one step, radians.
 LARGEST_TILT, LARGEST_TURN = 0.08, 0.15
 # Strengths of the priors over the median diagonal: differences of colours, weights, normals
@@ -194,8 +196,8 @@ def image_step(
 
     starts = list(pool.map(start, views))
     shape = (model.n_texels, 3 + model.n_lobes + N_ROTATIONS)
-    right = _scattered(views, [s.right for s in starts], shape)
-    diagonal = _scattered(views, [s.diagonal for s in starts], shape)
+    right = _scattered(views, [s.right for s in starts], shape, pool)
+    diagonal = _scattered(views, [s.diagonal for s in starts], shape, pool)
     priors = _priors(model, graph, diagonal)
 
     def product(x: Array) -> Array:
@@ -203,7 +205,7 @@ def image_step(
         parts = pool.map(
             lambda view, s: normal_product(view, s.system, single[view.texels]), views, starts
         )
-        return _scattered(views, list(parts), shape) + priors.product(x)
+        return _scattered(views, list(parts), shape, pool) + priors.product(x)
 
     right += priors.gradient(model, np.asarray(surface_normals, np.float64))
     change = _conjugate_gradients(product, right, diagonal + priors.diagonal())
@@ -221,12 +223,22 @@ def image_step(
 
 
 def _scattered(
-    views: Sequence[ViewPixels], parts: Sequence[Floats], shape: tuple[int, int]
+    views: Sequence[ViewPixels],
+    parts: Sequence[Floats],
+    shape: tuple[int, int],
+    pool: ThreadPoolExecutor,
 ) -> Array:
-    """Sum of the views' parts, in their order."""
+    """Sum of the views' parts, in their order; some of the texels in each thread."""
     total = np.zeros(shape)
-    for view, part in zip(views, parts, strict=True):
-        add_rows(view.texels, part, total)
+    edges = np.linspace(0, shape[0], TEXEL_RANGES + 1).astype(np.int32)
+    cuts = [np.searchsorted(view.texels, edges) for view in views]
+
+    def add(number: int) -> None:
+        for view, part, cut in zip(views, parts, cuts, strict=True):
+            some = slice(cut[number], cut[number + 1])
+            add_rows(view.texels[some], part[some], total)
+
+    list(pool.map(add, range(TEXEL_RANGES)))
     return total
 
 

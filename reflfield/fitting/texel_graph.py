@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
@@ -52,8 +53,12 @@ class TexelGraph:
 
     def all_around(self, true: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Where something is True of a texel and of all its neighbours; columns apart."""
-        false = (~true).astype(np.float32)
-        return np.asarray(true & ~((self.adjacency @ false) > 0))
+        columns = true.reshape(len(true), -1)
+        bits = np.packbits(columns, axis=1)
+        around = bits.copy()
+        _and_over_pairs(self.pairs, bits, around)
+        unpacked = np.unpackbits(around, axis=1, count=columns.shape[1])
+        return unpacked.astype(np.bool_).reshape(true.shape)
 
 
 def texel_graph(positions: NDArray[np.floating], normals: NDArray[np.floating]) -> TexelGraph:
@@ -85,5 +90,17 @@ def texel_graph(positions: NDArray[np.floating], normals: NDArray[np.floating]) 
     other, near = index.ravel(), distance.ravel() <= reach
     alike = np.einsum("nd,nd->n", normals[texel], normals[other]) > LEAST_COSINE
     kept = near & alike & (texel != other)
-    pairs = np.sort(np.stack([texel[kept], other[kept]], axis=1), axis=1)
-    return TexelGraph(n, np.unique(pairs, axis=0).reshape(-1, 2))
+    low, high = np.minimum(texel, other)[kept], np.maximum(texel, other)[kept]
+    # One number for each pair: rows of two take many times as long to sort.
+    pairs = np.stack(np.divmod(np.unique(low * n + high), n), axis=1)
+    return TexelGraph(n, pairs)
+
+
+@numba.njit(cache=True, nogil=True)
+def _and_over_pairs(pairs: Any, bits: Any, around: Any) -> None:
+    """Clear bits (n_texels, n_bytes) of `around` that are not set of a neighbour, too."""
+    for p in range(len(pairs)):
+        i, j = pairs[p, 0], pairs[p, 1]
+        for k in range(bits.shape[1]):
+            around[i, k] &= bits[j, k]
+            around[j, k] &= bits[i, k]

@@ -53,8 +53,8 @@ def robust_bounds(views: Sequence[View], workers: int = 1) -> tuple[Array, Array
     """
     origin, scale = _whereabouts(views)
     with thread_pool(workers) as pool:
-        found = pool.map(lambda some: _box_if_any(some, origin, scale), _subsets(views))
-        boxes = [box for box in found if box]
+        of_subsets = pool.map(lambda some: _box_if_any(some, origin, scale), _subsets(views))
+        boxes = [box for box in of_subsets if box]
     sizes = [float(np.max(high - low)) for low, high in boxes]
     if not sizes or not max(sizes) > 0.0:
         return None

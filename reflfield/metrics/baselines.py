@@ -153,6 +153,12 @@ class BaselineScores:
         measured = measure_image(replace(pair, relit=image), self.exposure)
         self._images[baseline].append(measured)
 
+    def extend(self, later: BaselineScores) -> None:
+        """Add the scores of further photographs."""
+        self._nearest += later._nearest
+        for name, images in later._images.items():
+            self._images[name] += images
+
     def to_dict(self, missing: Mapping[str, str]) -> dict[str, Any]:
         """What ``metrics.json`` says: metrics of each baseline, and why one is missing."""
         return {

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reflfield.capture.cameras import place_of_camera
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import SATURATED, with_bounded_black
 from reflfield.capture.directions import directions_towards
-from reflfield.capture.lights import Light
+from reflfield.capture.lights import Light, place_of_light
 from reflfield.observations.bilinear_sampling import Kinds, mark_kinds, sample_bilinear
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
@@ -63,6 +64,13 @@ def reached(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> NDArr
     """Whether each light sends anything (n, n_lights) to points, shadows aside."""
     points = np.asarray(positions, np.float64)
     return np.stack([light.reaches(points) for light in lights], axis=1)
+
+
+def shines(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether points get any of the colours of lights (n, n_lights, 3), shadows aside."""
+    has_colour = np.array([light.intensity > 0 for light in lights])
+    unknown = np.array([not light.known for light in lights])
+    return reached(lights, positions)[..., None] & (has_colour | unknown[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,8 +420,8 @@ def directions_of(
         Of an unknown light, world +Z: its direction does not enter.
     """
     points = np.asarray(positions, np.float64)
-    cameras = [camera.whereabouts for camera in capture.cameras]
-    lights = [light.whereabouts for light in capture.lights]
+    cameras = [place_of_camera(camera) for camera in capture.cameras]
+    lights = [place_of_light(light) for light in capture.lights]
     return (
         directions_towards(points, cameras, np.float32),
         directions_towards(points, lights, np.float32),

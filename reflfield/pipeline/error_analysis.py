@@ -18,15 +18,16 @@ from reflfield.metrics.baselines import BLACK, MEAN, Baselines, BaselineScores, 
 from reflfield.metrics.error_kinds import KindErrors, KindFinder, errors_by_kind
 from reflfield.metrics.held_out_photographs import RelitPairs
 from reflfield.metrics.image_metrics import Comparison, metrics_text, worst_to_best
-from reflfield.observations.image_projection import directions_of, facing_irradiance
+from reflfield.observations.image_projection import directions_of, shines
 from reflfield.pipeline import comparison, results
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.hold_out import held_out_counts
 from reflfield.pipeline.maps import AVERAGES
-from reflfield.pipeline.memory import within_memory
+from reflfield.pipeline.memory import readers_at_once, within_memory
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.render.nearest_photographs import NearestPhotographs, filled_from_nearest
 from reflfield.sphere.hemisphere import softened_cosine
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.progress import track
 
 STAGE = "error_analysis"
@@ -61,7 +62,8 @@ def write_error_analysis(context: Context, folder: Path) -> dict[str, Any]:
             # Where nothing was compared the baselines, of all texels, are not needed.
             analyser = analyser or analyser_of(context)
             (folder / name).mkdir()
-            analysed[name] = analyse(analyser, pairs, compared, folder / name)
+            at_once = min(context.resources.workers, readers_at_once(context))
+            analysed[name] = analyse(analyser, pairs, compared, folder / name, at_once)
             (folder / f"{name}.json").write_text(json.dumps(analysed[name], indent=2))
             n_images += len(pairs)
     (folder / "metrics.json").write_text(_metrics(context, analysed))
@@ -131,7 +133,7 @@ def mean_cosines(context: Context) -> NDArray[np.float64]:
         part = slice(first, first + step)
         _, lights = directions_of(training, texels.position[part])
         cosines = softened_cosine(np.einsum("nld,nd->nl", lights, texels.normal[part]))
-        shining = facing_irradiance(training.lights, texels.position[part]) > 0
+        shining = shines(training.lights, texels.position[part])
         weights = observed.part(part).counts()
         of_channel = weights[..., None] * shining
         total = np.einsum("nlc,nl->nc", of_channel, cosines)
@@ -140,7 +142,11 @@ def mean_cosines(context: Context) -> NDArray[np.float64]:
 
 
 def analyse(
-    analyser: Analyser, pairs: RelitPairs, compared: Comparison, folder: Path
+    analyser: Analyser,
+    pairs: RelitPairs,
+    compared: Comparison,
+    folder: Path,
+    at_once: int = 1,
 ) -> dict[str, Any]:
     """Measure the baselines of photographs, and find of what kind their errors are.
 
@@ -153,6 +159,8 @@ def analyse(
         Of them.
     folder : Path
         Gets the images of a few photographs.
+    at_once : int
+        Photographs that are analysed side by side.
 
     Returns
     -------
@@ -161,9 +169,19 @@ def analyse(
     """
     scores, errors = BaselineScores(compared.exposure), KindErrors.none()
     shown = shown_photographs(compared)
-    for i in track(range(len(pairs)), len(pairs), "baselines"):
-        is_shown = pairs.capture.photographs[i].name in shown
-        errors += _analyse_one(analyser, pairs, i, scores, folder if is_shown else None)
+
+    def one(index: int) -> tuple[BaselineScores, KindErrors]:
+        is_shown = pairs.capture.photographs[index].name in shown
+        of_one = BaselineScores(compared.exposure)
+        return of_one, _analyse_one(
+            analyser, pairs, index, of_one, folder if is_shown else None
+        )
+
+    with thread_pool(at_once) as pool:
+        analysed = pool.map(one, range(len(pairs)))
+        for of_one, kind_errors in track(analysed, len(pairs), "baselines"):
+            scores.extend(of_one)
+            errors += kind_errors
     return {
         BASELINES: scores.to_dict(analyser.baselines.missing),
         ERROR_KINDS: {

@@ -59,7 +59,13 @@ from reflfield.pipeline.bounce_fit import gain_counts, with_bounced_light
 from reflfield.pipeline.cache import WARNINGS, plain
 from reflfield.pipeline.context import Context
 from reflfield.pipeline.memory import readers_at_once, working_bytes
-from reflfield.pipeline.pixel_shares import Shares, shares_within, some_of, spread_over
+from reflfield.pipeline.pixel_shares import (
+    HULL_EFFORT,
+    Shares,
+    shares_within,
+    some_of,
+    spread_over,
+)
 from reflfield.pipeline.quantisation_search import SAMPLES_MEASURED, field_metadata
 from reflfield.render.camera_rays import FieldSurface
 from reflfield.util.blas_threads import thread_pool
@@ -89,6 +95,19 @@ MODEL, WHITE = "model.npz", "white"
 STEP = 1 / 64
 
 
+@results.cached("atlas")
+def neighbours(context: Context) -> TexelGraph:
+    """Neighbours of the texels of a surface."""
+    texels = results.texels(context)
+    return texel_graph(texels.position, texels.normal)
+
+
+@results.cached("visibility")
+def lit_around(context: Context) -> NDArray[np.bool_]:
+    """(n_texels, n_lights) True where a light reaches a texel and all its neighbours."""
+    return neighbours(context).all_around(results.light_visible(context))
+
+
 @dataclass(frozen=True, eq=False)
 class HalfVectorFit:
     """A fit of the half-vector model in one run.
@@ -108,15 +127,14 @@ class HalfVectorFit:
     @cached_property
     def graph(self) -> TexelGraph:
         """Neighbours of the texels."""
-        texels = results.texels(self.context)
-        return texel_graph(texels.position, texels.normal)
+        return neighbours(self.context)
 
     @cached_property
     def reliable(self) -> NDArray[np.bool_]:
         """(n_texels, n_lights) True where no shadow's edge passes within a texel."""
         if self.context.visibility_kind == "kept":
             return np.ones_like(results.light_visible(self.context))
-        return self.graph.all_around(results.light_visible(self.context))
+        return lit_around(self.context)
 
     @cached_property
     def white(self) -> float:
@@ -266,7 +284,9 @@ class HalfVectorFit:
         covered = [np.count_nonzero(silhouette >= LEAST_COVERAGE) for silhouette in silhouettes]
         n_photographs = (training.photograph_index >= 0).sum(axis=1)
         n_values = max(int(np.dot(covered, n_photographs)), 1)
-        return shares_within(max(int(sum(covered)), 1), n_values, memory)
+        moves = self.context.options.refines_surface and not self.context.on_surface
+        effort = HULL_EFFORT if moves else 1.0
+        return shares_within(max(int(sum(covered)), 1), n_values, memory, effort)
 
     def allocator(
         self, views: Sequence[ViewPixels], n_lobes: int, folder: Path

@@ -14,6 +14,9 @@ Indices = NDArray[np.intp]
 # Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
 # would take hours, or minutes.
 MOST_PIXELS, MOST_FOOTPRINTS = 12_000_000, 1_500_000
+# Of these limits, for the fit on a hull whose surface then moves: normals and where to start
+# from are all that is taken from it.
+HULL_EFFORT = 0.5
 # Photographs of each view that are fitted to at least, before pixels are left out: neighbouring
 # texels under one pixel are told apart by many pixels, not by many lights.
 LEAST_PHOTOGRAPHS = 8
@@ -33,7 +36,7 @@ class Shares(NamedTuple):
         return self.pixels * self.photographs
 
 
-def shares_within(n_pixels: int, n_values: int, memory: float) -> Shares:
+def shares_within(n_pixels: int, n_values: int, memory: float, effort: float = 1.0) -> Shares:
     """Shares of pixels and photographs within the limits of time and memory.
 
     Parameters
@@ -44,6 +47,8 @@ def shares_within(n_pixels: int, n_values: int, memory: float) -> Shares:
         Pixels under a light.
     memory : float
         Bytes.
+    effort : float
+        Share of the limits of time.
 
     Examples
     --------
@@ -54,15 +59,16 @@ def shares_within(n_pixels: int, n_values: int, memory: float) -> Shares:
     >>> shares_within(1000, 20_000, 1e12)
     Shares(pixels=1.0, photographs=1.0)
     """
+    most_values, most_footprints = effort * MOST_PIXELS, effort * MOST_FOOTPRINTS
     least = min(1.0, LEAST_PHOTOGRAPHS * n_pixels / n_values)
-    pixels = min(1.0, MOST_FOOTPRINTS / n_pixels)
-    photographs = min(1.0, MOST_PIXELS / (pixels * n_values))
+    pixels = min(1.0, most_footprints / n_pixels)
+    photographs = min(1.0, most_values / (pixels * n_values))
     free = memory / pixels - FOOTPRINT_BYTES * n_pixels
     photographs = min(photographs, free / (VALUE_BYTES * n_values))
     if photographs >= least:
         return Shares(pixels, photographs)
     of_pixel = VALUE_BYTES * least * n_values + FOOTPRINT_BYTES * n_pixels
-    within = min(MOST_PIXELS / (least * n_values), memory / of_pixel)
+    within = min(most_values / (least * n_values), memory / of_pixel)
     return Shares(min(pixels, within), least)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ from reflfield.pipeline.held_out_silhouettes import silhouettes_of
 from reflfield.pipeline.hollows import SHARE
 from reflfield.pipeline.hull import LEFT_OUT
 from reflfield.pipeline.maps import AVERAGES
+from reflfield.pipeline.memory import readers_at_once
 from reflfield.pipeline.quantisation_search import missed_quality
 from reflfield.pipeline.rate_distortion import stored_points
 from reflfield.pipeline.sample_bookkeeping import sample_counts
@@ -154,7 +157,8 @@ def _surface_sections(
     origin = context.training.silhouette_origin(0)
     hull, hollows, made = map(context.stages.record, ("hull", "hollows", "atlas"))
     yield sections.silhouettes_section(
-        _silhouette_views(context),
+        _SilhouetteViews(context, RayScene(results.atlas(context).mesh, threads=1)),
+        workers=min(context.resources.workers, readers_at_once(context)),
         origin={
             "file": "given with the capture",
             "alpha": "alpha of the photographs",
@@ -206,21 +210,33 @@ def surface_views(context: Context) -> Iterator[sections.SurfaceView]:
         )
 
 
-def _silhouette_views(context: Context) -> Iterator[sections.SilhouetteView]:
-    scene = RayScene(results.atlas(context).mesh, threads=context.resources.workers)
-    for i, camera in enumerate(context.training.cameras):
-        photographs = context.training.photograph_index[i]
-        photographed = photographs[photographs >= 0]
-        yield sections.SilhouetteView(
+@dataclass(frozen=True, eq=False)
+class _SilhouetteViews(Sequence[sections.SilhouetteView]):
+    """Views of a run beside the hull, each worked out when it is asked for."""
+
+    context: Context
+    scene: RayScene
+
+    def __len__(self) -> int:
+        return self.context.training.n_views
+
+    def __getitem__(self, view: Any) -> Any:
+        camera = self.context.training.cameras[view]
+        return sections.SilhouetteView(
             name=camera.id,
-            photograph=(
-                context.training.read_photograph(int(photographed[0]))
-                if len(photographed)
-                else np.zeros((camera.height, camera.width, 3), np.float32)
-            ),
-            silhouette=results.silhouettes(context)[i],
-            hull_silhouette=scene.silhouette(camera),
+            photograph=partial(self._photograph, view),
+            silhouette=results.silhouettes(self.context)[view],
+            hull_silhouette=self.scene.silhouette(camera),
         )
+
+    def _photograph(self, view: int) -> NDArray[np.float32]:
+        """The first of a view; black if there is none."""
+        training = self.context.training
+        camera, photographs = training.cameras[view], training.photograph_index[view]
+        photographed = photographs[photographs >= 0]
+        if not len(photographed):
+            return np.zeros((camera.height, camera.width, 3), np.float32)
+        return training.read_photograph(int(photographed[0]))
 
 
 def _photograph_sections(

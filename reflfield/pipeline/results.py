@@ -133,13 +133,19 @@ def base_surface(context: Context) -> BaseSurface:
 @cached("visibility")
 def view_visible(context: Context) -> Bools:
     """(n_texels, n_views) True where the camera sees the texel."""
-    return arrays(context, "visibility", "visibility.npz")["views"]
+    return _unpacked(context, "views", context.training.n_views)
 
 
 @cached("visibility")
 def light_visible(context: Context) -> Bools:
     """(n_texels, n_lights) True where the light reaches the texel."""
-    return arrays(context, "visibility", "visibility.npz")["lights"]
+    return _unpacked(context, "lights", context.training.n_lights)
+
+
+def _unpacked(context: Context, name: str, n: int) -> Bools:
+    """What the stage "visibility" has found, from eight in a byte."""
+    bits = arrays(context, "visibility", "visibility.npz")[name]
+    return np.unpackbits(bits, axis=1, count=n).astype(np.bool_)
 
 
 def depth_edges(context: Context, view: int) -> Bools:

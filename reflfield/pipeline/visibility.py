@@ -31,6 +31,7 @@ from reflfield.pipeline.view_store import (
     store_views,
     unpacked_mask,
 )
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.dask_cluster import threads_here
 
 # Views, or lights, of one block; what a block calls the texels that they see.
@@ -63,7 +64,11 @@ def write_visibility(context: Context, folder: Path) -> dict[str, Any]:
             "cameras: expected at least one that sees the surface, found none; check the "
             "calibration against the silhouettes"
         )
-    np.savez_compressed(folder / "visibility.npz", views=views, lights=lights)
+    np.savez(
+        folder / "visibility.npz",
+        views=np.packbits(views, axis=1),
+        lights=np.packbits(lights, axis=1),
+    )
     named_edges = (named for part in parts for named in part.items() if named[0] != SEEN)
     store_views(folder / EDGES, named_edges)
     return {
@@ -126,8 +131,10 @@ def visibility_block(shared: VisibilityRays, block: tuple[str, range]) -> dict[s
 
 def covered_pixels(context: Context) -> list[NDArray[np.uint8]]:
     """Pixels of each view that count as covered by the object, eight in a byte."""
-    least = context.options.visibility.coverage
-    return [packed_mask(silhouette >= least) for silhouette in results.silhouettes(context)]
+    least, silhouettes = context.options.visibility.coverage, results.silhouettes(context)
+    with thread_pool(min(context.resources.workers, readers_at_once(context))) as pool:
+        views = range(len(silhouettes))
+        return list(pool.map(lambda view: packed_mask(silhouettes[view] >= least), views))
 
 
 def runs(n: int) -> list[range]:

@@ -1,5 +1,6 @@
 """A small made-up result that fills every section of the report."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -66,8 +67,8 @@ def full_content(rng, title="vase", prefix="heldout_"):
         for s in (1.0, 6.0)
     ]  # fmt: skip
     views = [
-        sections.SilhouetteView(f"{prefix}v{i:03d}", p.photograph, p.silhouette,
-                                disk(64, 0.4 * 64 + (i - 3) * 0.5))
+        sections.SilhouetteView(f"{prefix}v{i:03d}", partial(getattr, p, "photograph"),
+                                p.silhouette, disk(64, 0.4 * 64 + (i - 3) * 0.5))
         for i, p in enumerate(pairs)
     ]  # fmt: skip
     stages = [

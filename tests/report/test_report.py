@@ -125,7 +125,9 @@ HOSTILE = "<script>alert('x')</script>\"'&$title"
 def test_names_from_outside_are_escaped(samples):
     def page(name):
         pairs = samples.frame_pairs(np.random.default_rng(5), 2, 24, prefix=name)
-        view = sections.SilhouetteView(name, pairs[0].photograph, *[pairs[0].silhouette] * 2)
+        view = sections.SilhouetteView(
+            name, lambda: pairs[0].photograph, *[pairs[0].silhouette] * 2
+        )
         shown = (
             sections.held_out_section(compare_images(pairs), pairs),
             sections.silhouettes_section([view]),

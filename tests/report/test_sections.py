@@ -51,8 +51,8 @@ def test_silhouette_agreement_is_counted():
     photograph = np.ones((20, 20, 3))
     section = sections.silhouettes_section(
         [
-            sections.SilhouetteView("good", photograph, silhouette, silhouette),
-            sections.SilhouetteView("bad", photograph, silhouette, hull),
+            sections.SilhouetteView("good", lambda: photograph, silhouette, silhouette),
+            sections.SilhouetteView("bad", lambda: photograph, silhouette, hull),
         ],
         max_pictures=1,
     )
@@ -175,7 +175,7 @@ def test_degenerate_input_still_makes_a_page(rng, samples):
                 sections.silhouettes_section(
                     [
                         sections.SilhouetteView(
-                            "v", pair[0].photograph, empty, samples.disk(24, 5)
+                            "v", lambda: pair[0].photograph, empty, samples.disk(24, 5)
                         )
                     ]
                 ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from reflfield.report.page import (
     Table,
     encode_picture,
 )
+from reflfield.util.blas_threads import thread_pool
 from reflfield.util.image_boxes import bounding_box
 
 SHEET_PX = 360
@@ -35,22 +36,23 @@ class SilhouetteView:
     Attributes
     ----------
     name : str
-    photograph : (h, w, 3) float
-        Linear radiance; any light.
+    photograph : callable
+        Gives linear radiance (h, w, 3) under any light; called where it is shown.
     silhouette, hull_silhouette : (h, w) float
         Coverage as photographed, and of the hull seen by the same camera.
     """
 
     name: str
-    photograph: NDArray[Any]
+    photograph: Callable[[], NDArray[Any]]
     silhouette: NDArray[Any]
     hull_silhouette: NDArray[Any]
 
 
 def silhouettes_section(
-    views: Iterable[SilhouetteView],
+    views: Sequence[SilhouetteView],
     *,
     origin: str = "",
+    workers: int = 1,
     max_pictures: int = 12,
     left_out: Collection[str] = (),
     carved: float = 0.0,
@@ -59,10 +61,12 @@ def silhouettes_section(
 
     Parameters
     ----------
-    views : iterable of SilhouetteView
-        Read once, one at a time.
+    views : sequence of SilhouetteView
+        Those that are shown are asked for twice.
     origin : str
         Where the silhouettes came from, such as "found by GrabCut".
+    workers : int
+        Threads, each of which asks for a view.
     max_pictures : int
         Views with the lowest IoU are shown.
     left_out : collection of str
@@ -74,17 +78,17 @@ def silhouettes_section(
     -------
     Section
     """
-    rows, shown = [], dict[tuple[float, str], Panel]()
-    for view in views:
-        rows.append(_agreement(view))
-        # Pictures of all views of a large capture would take long, photographs memory.
-        place = (rows[-1][1], view.name)
-        if len(shown) < max_pictures or place < max(shown):
-            shown[place] = Panel(_overlay(view), f"{view.name} · IoU {place[0]:.3f}")
-            shown = dict(sorted(shown.items())[:max_pictures])
-    rows.sort(key=lambda row: (row[1], row[0]))
+    with thread_pool(workers) as pool:
+        agreements = pool.map(
+            lambda number: (*_agreement(views[number]), number), range(len(views))
+        )
+        rows = sorted(agreements, key=lambda row: (row[1], row[0]))
+    shown = [
+        Panel(_overlay(views[number]), f"{name} · IoU {iou:.3f}")
+        for name, iou, *_, number in rows[:max_pictures]
+    ]
     figure = Figure(
-        tuple(shown.values()),
+        tuple(shown),
         "Views with the lowest IoU come first. The two outlines should coincide. Red areas "
         "were carved away although the photograph shows the object there (a wrong camera "
         "pose, or a silhouette that is too small in another view); yellow areas are hull "
@@ -105,7 +109,7 @@ def silhouettes_section(
                 f"{100 * missing:.2f}",
                 f"{100 * beyond:.2f}",
             )
-            for name, iou, missing, beyond in rows
+            for name, iou, missing, beyond, _ in rows
         ),
         "Agreement per view: intersection over union; area missing from the hull and area "
         "beyond the silhouette, in percent of the silhouette.",
@@ -149,7 +153,7 @@ def _overlay(view: SilhouetteView) -> Picture:
     covered = _covered(view.silhouette)
     hull = _covered(view.hull_silhouette)
     box = bounding_box(covered | hull, margin=8)
-    photograph, seen = np.asarray(view.photograph)[box], covered[box]
+    photograph, seen = np.asarray(view.photograph())[box], covered[box]
     exposure = _exposure_of(photograph, seen)
     # Outlines are one pixel wide; on small photographs that would hide the gaps.
     factor = max(1, SHEET_PX // max(seen.shape))
