@@ -36,6 +36,7 @@ from reflfield.observations.texel_samples import (
     transformed_samples,
 )
 from reflfield.sphere.hemisphere import softened_cosine
+from reflfield.util.blas_threads import thread_pool
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -242,34 +243,35 @@ class TexelReader:
         lit = reached(self.capture.lights, self.positions[texels])
         return observed.views[texels], observed.lights[texels] & lit
 
-    def count_fitted(self, texels: Indices) -> SampleCount:
+    def count_fitted(self, texels: Indices, workers: int = 1) -> SampleCount:
         """Samples of some texels that count in the reader's frames.
 
-        They are read only where values of some were not measured.
+        They are read only where values of some were not measured. `workers` are threads.
         """
-        fitted, unmeasured = 0, 0
-        for first in range(0, len(texels), TEXELS_COUNTED_AT_ONCE):
-            some = texels[first : first + TEXELS_COUNTED_AT_ONCE]
-            frames = self.local_from_world[some]
-            view, light = (
-                local_directions(frames, directions)
-                for directions in directions_of(self.capture, self.positions[some])
-            )
-            counts = above_horizon(*self._seen(some), view, light, self.sides)
-            observed = Observed(*counts, self.store.observed.pairs)
-            n_gaps = self._count_unmeasured(some, observed) if self.store.has_gaps else 0
-            fitted += observed.count() - n_gaps
-            unmeasured += n_gaps
-        return SampleCount(fitted, unmeasured)
+        step = max(
+            1, min(TEXELS_COUNTED_AT_ONCE, COUNTING_BYTES // self.sample_bytes_per_texel)
+        )
+        parts = [
+            block[first : first + step]
+            for block in self.blocks_of(texels)
+            for first in range(0, len(block), step)
+        ]
+        with thread_pool(workers) as pool:
+            counts = list(pool.map(self._count, parts))
+        return SampleCount(sum(c.fitted for c in counts), sum(c.unmeasured for c in counts))
 
-    def _count_unmeasured(self, texels: Indices, observed: Observed) -> int:
-        """Samples of which no channel was measured."""
-        step, total = max(1, COUNTING_BYTES // self.sample_bytes_per_texel), 0
-        for first in range(0, len(texels), step):
-            part = slice(first, first + step)
-            nothing = np.isnan(self.store.read(texels[part])).all(axis=2)
-            total += int(np.count_nonzero(nothing & observed.of_texels(part)))
-        return total
+    def _count(self, texels: Indices) -> SampleCount:
+        frames = self.local_from_world[texels]
+        view, light = (
+            local_directions(frames, directions)
+            for directions in directions_of(self.capture, self.positions[texels])
+        )
+        above = above_horizon(*self._seen(texels), view, light, self.sides)
+        observed, n_gaps = Observed(*above, self.store.observed.pairs), 0
+        if self.store.has_gaps:
+            red, green, blue = np.moveaxis(np.isnan(self.store.read(texels)), 2, 0)
+            n_gaps = int(np.count_nonzero(red & green & blue & observed.of_texels(slice(None))))
+        return SampleCount(observed.count() - n_gaps, n_gaps)
 
     def transformed(self, texels: Indices) -> TransformedSamples:
         """Transformed samples, taps and weights of some texels."""

@@ -62,7 +62,9 @@ def write_compressed(texels: Resampled, maker: FieldMaker, folder: Path) -> dict
     raw = results.base_reader(context).store.raw_bytes()
     error = sample_error(made, results.base_reader(context), results.measured_texels(context))
     n_fitted = len(results.measured_texels(context))
-    counted = reader.count_fitted(np.flatnonzero(results.sampled(context).any(axis=1)))
+    counted = reader.count_fitted(
+        np.flatnonzero(results.sampled(context).any(axis=1)), context.resources.workers
+    )
     return {
         "texels fitted": n_fitted,
         "texels that repeat another": made.n_texels - n_fitted,

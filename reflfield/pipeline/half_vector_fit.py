@@ -446,7 +446,7 @@ def write_half_vector_field(context: Context, folder: Path) -> dict[str, Any]:
     raw = results.base_reader(context).store.raw_bytes()
     error = sample_error(made, results.base_reader(context), results.measured_texels(context))
     counted = results.base_reader(context).count_fitted(
-        np.flatnonzero(results.sampled(context).any(axis=1))
+        np.flatnonzero(results.sampled(context).any(axis=1)), context.resources.workers
     )
     return {
         "texels fitted": len(results.measured_texels(context)),
