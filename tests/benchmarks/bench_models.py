@@ -5,10 +5,10 @@
     python tests/benchmarks/bench_models.py dense_vase --models auto
 
 Objects that a model may fail on: concave with interreflection, matt under few lights, brushed
-in another direction in each triangle (a pixel mixes them), textured satin, measured paint; and
-the vase of the demo in a dome of four times as many photographs, which takes long: it is
-measured only by name, and has results of its own.
-Scenes are in `scenes/`; `painted_bob` needs the mesh and the material of the test data
+in another direction in each triangle (a pixel mixes them), textured satin, measured paint and
+measured woven satin; and the vase of the demo in a dome of four times as many photographs,
+which takes long: it is measured only by name, and has results of its own.
+Scenes are in `scenes/`; `painted_bob` and `woven_bob` need mesh and material of the test data
 (REFLFIELD_DATA). Every field is made by ``reflfield run`` with default options but for the
 model, and compared with held-out photographs and with those of views and lights that are not in
 the capture.
@@ -41,12 +41,14 @@ KINDS = (
     "brushed_facets",
     "satin_sphere",
     "painted_bob",
+    "woven_bob",
 )
 BY_NAME_ONLY = ("dense_vase",)
 MODELS = ("auto", "half_vector", "clustered")
 # Files of the test data that a scene needs beside it.
 NEEDED = {
     "painted_bob": ("meshes/bob/bob_tri.obj", "rgl_bsdf/cc_ibiza_sunset_rgb.bsdf"),
+    "woven_bob": ("meshes/bob/bob_tri.obj", "rgl_bsdf/satin_rosaline_rgb.bsdf"),
 }
 
 
