@@ -1,6 +1,7 @@
 """Whole runs with the half-vector model on the tiny capture."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from reflfield.options import HoldOut, Resources
 from reflfield.pipeline import half_vector_fit, model_selection, pixel_shares, results
 from reflfield.pipeline.pipeline_options import ComparisonOptions, PipelineOptions
 from reflfield.pipeline.pixel_shares import shares_within, some_of, spread_over
+from reflfield.pipeline.sample_bookkeeping import sample_counts
 from reflfield.pipeline.stages import run
 from reflfield.render.renderer import RenderOptions
 
@@ -100,6 +102,18 @@ def test_commands_take_its_field(words, made, tiny_capture, sky, tmp_path, reflf
     out = () if words[0] == "inspect" else ("-o", tmp_path / "out")
     outcome = reflfield(*(paths.get(word, word) for word in words), *out)
     assert outcome.status == 0, outcome.err
+
+
+def test_counts_are_those_of_the_surface_that_the_field_is_on(tiny_capture, made, tmp_path):
+    context = half_vector_run(tiny_capture, shutil.copytree(made, tmp_path / "run"))
+    counts = list(sample_counts(context))
+    assert [count.missing for count in counts] == [0] * len(counts)
+    samples = next(count for count in counts if count.things == "samples")
+    assert samples.parts["fitted"] > samples.parts["in shadow: fitted as indirect light"] > 0
+    # The hull's own is of no use where it moves.
+    stages = [record.name for record in context.stages.records]
+    assert "surface_indirect" in stages
+    assert "indirect" not in stages
 
 
 @pytest.mark.slow

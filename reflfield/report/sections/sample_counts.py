@@ -31,12 +31,16 @@ class CountedItems:
     def missing(self) -> int:
         """Items that no part holds; negative where some are counted twice.
 
+        A part of less than none holds nothing: what makes up for it is counted twice.
+
         Examples
         --------
         >>> CountedItems("capture", "photographs", 9, {"used": 6, "held out": 2}).missing
         1
+        >>> CountedItems("capture", "photographs", 9, {"used": 11, "rest": -2}).missing
+        -2
         """
-        return self.total - sum(self.parts.values())
+        return self.total - sum(max(count, 0) for count in self.parts.values())
 
 
 def bookkeeping_section(entries: Sequence[CountedItems]) -> Section:
