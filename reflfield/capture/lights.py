@@ -7,16 +7,24 @@ by this number and the cosine stays in the data.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reflfield.capture.directions import Whereabouts, directions_towards
 from reflfield.errors import CaptureError, InputError
+from reflfield.util.late_import import LateImport
 from reflfield.util.validation import check_shape, not_a_rotation_because
 from reflfield.util.vector_lengths import lengths
+
+if TYPE_CHECKING:
+    from reflfield.capture import point_kernels as kernels
+else:
+    kernels = LateImport("reflfield.capture.point_kernels")
 
 Array = NDArray[np.float64]
 
@@ -237,6 +245,40 @@ def check_single(light: Light) -> None:
             f"light {light.id!r}: expected a single light, received kind {light.kind!r}, "
             "which has no single direction or irradiance; sum over its map or its members"
         )
+
+
+def facing_irradiance(
+    lights: Sequence[Light], positions: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Irradiance (n, n_lights, 3) that surfaces facing each light get; see `Light.irradiance`.
+
+    Raises
+    ------
+    InputError
+        For an environment or a group.
+
+    Examples
+    --------
+    >>> lamps = [PointLight([0, 0, 2], 8.0), DirectionalLight([0, 0, 1], 3.0)]
+    >>> facing_irradiance(lamps, np.zeros((1, 3)))[0, :, 0]
+    array([2., 3.], dtype=float32)
+    """
+    points = np.ascontiguousarray(positions, np.float64)
+    for light in lights:
+        check_single(light)
+    irradiance = np.zeros((len(points), len(lights), 3), np.float32)
+    places = np.array([light.position for light in lights]).reshape(-1, 3)
+    known = np.array([light.known for light in lights], np.bool_)
+    intensities = np.array([light.intensity for light in lights]).reshape(-1, 3)
+    intensities = np.where(known[:, None], intensities, 1.0)
+    falling = np.array([light.kind == POINT and light.falls_off for light in lights], np.bool_)
+    kernels.irradiance_of_points(
+        points, places, intensities, falling, SMALLEST_DISTANCE, irradiance
+    )
+    for j, light in enumerate(lights):
+        if light.kind == SPOT:
+            irradiance[:, j] = light.irradiance(points)
+    return irradiance
 
 
 def place_of_light(light: Light) -> Whereabouts:

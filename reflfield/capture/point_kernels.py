@@ -23,6 +23,28 @@ def unit_towards(points: Any, places: Any, are_points: Any, least: float, out: A
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def irradiance_of_points(
+    points: Any, places: Any, intensities: Any, fall_off: Any, least: float, out: Any
+) -> None:
+    """Irradiance (n, n_lights, 3) of surfaces that face point lights, or constant ones.
+
+    Those that do not fall off with the distance, 1/d^2, have their intensity everywhere.
+    """
+    for i in range(len(points)):
+        for j in range(len(places)):
+            share = 1.0
+            if fall_off[j]:
+                x, y, z = (
+                    places[j, 0] - points[i, 0],
+                    places[j, 1] - points[i, 1],
+                    places[j, 2] - points[i, 2],
+                )
+                share = 1.0 / max(x * x + y * y + z * z, least * least)
+            for c in range(3):
+                out[i, j, c] = share * intensities[j, c]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def project_straight(points: Any, pose: Any, matrix: Any, pixels: Any, depth: Any) -> None:
     """Pixels of points in a perspective camera that keeps lines straight.
 

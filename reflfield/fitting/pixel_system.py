@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from reflfield.capture.cameras import Camera
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import MEASURED, SATURATED
-from reflfield.capture.lights import Light
+from reflfield.capture.lights import Light, facing_irradiance
 from reflfield.field.half_vector import HalfVectorModel
 from reflfield.fitting.pixel_kernels import (
     N_ROTATIONS,
@@ -28,7 +28,6 @@ from reflfield.fitting.pixel_kernels import (
     texels_shown,
     weigh_through_pixels,
 )
-from reflfield.observations.image_projection import facing_irradiance
 from reflfield.render.camera_rays import FieldSurface, subpixel_offsets
 
 Floats = NDArray[np.float32]

@@ -118,8 +118,10 @@ def mean_sample(values: np.ndarray, observed: np.ndarray) -> np.ndarray:
     -------
     (n, 3) float
     """
-    measured = ~np.isnan(values)
-    counted = observed.astype(np.float32)
-    weight = np.einsum("npc,np->nc", measured.astype(np.float32), counted)
-    total = np.einsum("npc,np->nc", np.where(measured, values, 0).astype(np.float32), counted)
-    return total / np.where(weight > 0, weight, np.nan)
+    single, counted = values.astype(np.float32), observed.astype(np.float32)[:, None]
+    total, weight = (counted @ single)[:, 0], counted.sum(axis=2)
+    if np.isnan(total).any():
+        measured = ~np.isnan(single)
+        weight = (counted @ measured.astype(np.float32))[:, 0]
+        total = (counted @ np.where(measured, single, np.float32(0)))[:, 0]
+    return np.asarray(total / np.where(weight > 0, weight, np.nan))

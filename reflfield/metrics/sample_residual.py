@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from reflfield.capture.color_spaces import LUMINANCE
 from reflfield.capture.encoding import encode_srgb
+from reflfield.capture.lights import facing_irradiance
 from reflfield.errors import InputError
 from reflfield.field.evaluation import evaluate
 from reflfield.field.reflectance_field import ReflectanceField
 from reflfield.metrics.image_errors import psnr
-from reflfield.observations.image_projection import facing_irradiance
 from reflfield.observations.texel_reading import TexelReader
 
 Floats = NDArray[np.float32]

@@ -14,7 +14,7 @@ from reflfield.capture.cameras import place_of_camera
 from reflfield.capture.capture import Capture
 from reflfield.capture.clipping import SATURATED, with_bounded_black
 from reflfield.capture.directions import directions_towards
-from reflfield.capture.lights import Light, place_of_light
+from reflfield.capture.lights import Light, facing_irradiance, place_of_light
 from reflfield.observations.bilinear_sampling import Kinds, mark_kinds, sample_bilinear
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import (
@@ -49,15 +49,6 @@ HALF_MAX = 65504.0
 BUDGET = 256 << 20
 # Lights sampled together: the pixel positions are worked out once for all of them.
 LIGHTS_AT_ONCE = 32
-
-
-def facing_irradiance(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> Floats:
-    """Irradiance (n, n_lights, 3) that a surface facing each light gets; 1 if unknown."""
-    points = np.asarray(positions, np.float64)
-    irradiance = np.zeros((len(points), len(lights), 3), np.float32)
-    for j, light in enumerate(lights):
-        irradiance[:, j] = light.irradiance(points)
-    return irradiance
 
 
 def reached(lights: tuple[Light, ...], positions: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -248,7 +239,8 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
     block = np.zeros((len(points), len(photographs), 3), np.float16)
     of_block, starts = np.unique(views, return_index=True)
     counts = np.zeros((len(of_block), len(VALUE_KINDS)), np.int64)
-    measured = np.zeros((len(points), projection.pairs.n_lights), np.bool_)
+    # Light by light, so that of most only ones are written.
+    measured = np.zeros((projection.pairs.n_lights, len(points)), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
     peaks, brightest, darkest = np.zeros(len(photographs), np.float32), 0.0, 0.0
@@ -260,10 +252,12 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
             projection.capture, int(view), lights[first:end], points[seen], projection.budget
         ):
             stored = np.clip(values / np.float32(unit), -HALF_MAX, HALF_MAX)
-            block[seen[:, None], first + some] = stored.astype(np.float16)
+            block[seen, first + some[0] : first + some[-1] + 1] = stored.astype(np.float16)
             peaks[first + some] = brightest_pixels
             counts[i] += _counts_of(kinds)
-            measured[seen[:, None], lights[first + some]] |= IS_KNOWN[kinds].any(axis=2)
+            is_known = np.asarray(IS_KNOWN[kinds].any(axis=2)) if kinds.any() else None
+            for j, light in enumerate(lights[first + some]):
+                measured[light, seen if is_known is None else seen[is_known[:, j]]] = True
             brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
             darkest = min(darkest, float(np.fmin.reduce(values, axis=None, initial=0.0)))
     store[:, photographs.start : photographs.stop] = block
@@ -271,7 +265,7 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
         "photographs": np.array(len(photographs)),
         "views": of_block,
         "values": counts,
-        "measured": np.packbits(measured, axis=1),
+        "measured": np.packbits(measured.T, axis=1),
         "brightest": np.array(brightest),
         "darkest": np.array(darkest),
         "peaks": peaks,

@@ -237,7 +237,7 @@ class HalfVectorFit:
     def pixels(self, model: HalfVectorModel, pool: ThreadPoolExecutor) -> list[ViewPixels]:
         """Pixels of views with photographs, the texels under them as the field is rendered."""
         context, texels = self.context, results.texels(self.context)
-        surface = FieldSurface(self.build(model, 0.0))
+        surface = FieldSurface(self._quantised(model, 0.0, None, {}))
         shares, seed = self.shares, context.options.seed
         # As many photographs at a time as the ceiling of memory allows.
         readers = BoundedSemaphore(readers_at_once(context))
@@ -302,14 +302,23 @@ class HalfVectorFit:
         self, model: HalfVectorModel, step: float, indirect: IndirectLight | None = None
     ) -> HalfVectorField:
         """Quantise a model in units of white on the base surface into a field."""
-        context = self.context
+        metadata = field_metadata(self.context, plain(self.context.options))
+        return self._quantised(model, step, indirect, metadata)
+
+    def _quantised(
+        self,
+        model: HalfVectorModel,
+        step: float,
+        indirect: IndirectLight | None,
+        metadata: dict[str, Any],
+    ) -> HalfVectorField:
         return build_half_vector_field(
-            results.base_surface(context),
+            results.base_surface(self.context),
             in_samples(model, self.white),
             indirect,
-            domain=context.options.resampling.domain,  # type: ignore[arg-type]
-            visibility=context.visibility_kind,  # type: ignore[arg-type]
-            metadata=field_metadata(context, plain(context.options)),
+            domain=self.context.options.resampling.domain,  # type: ignore[arg-type]
+            visibility=self.context.visibility_kind,  # type: ignore[arg-type]
+            metadata=metadata,
             quantisation=Quantisation(step),
         )
 

@@ -55,11 +55,11 @@ from reflfield.api.light_calibration import (  # noqa: E402
     lights_of_photographs,
 )
 from reflfield.capture.encoding import decode_srgb, encode_srgb  # noqa: E402
+from reflfield.capture.lights import facing_irradiance  # noqa: E402
 from reflfield.capture.readers import open_capture  # noqa: E402
 from reflfield.field.file import open_field  # noqa: E402
 from reflfield.metrics.frame_errors import angle_deg  # noqa: E402
 from reflfield.metrics.image_metrics import common_exposure, compare_images  # noqa: E402
-from reflfield.observations.image_projection import facing_irradiance  # noqa: E402
 from reflfield.options import HoldOut, Resources  # noqa: E402
 from reflfield.pipeline import results as stage_results  # noqa: E402
 from reflfield.pipeline import stages  # noqa: E402
