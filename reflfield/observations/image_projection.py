@@ -239,8 +239,7 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
     block = np.zeros((len(points), len(photographs), 3), np.float16)
     of_block, starts = np.unique(views, return_index=True)
     counts = np.zeros((len(of_block), len(VALUE_KINDS)), np.int64)
-    # Light by light, so that of most only ones are written.
-    measured = np.zeros((projection.pairs.n_lights, len(points)), np.bool_)
+    measured = np.zeros((len(points), projection.pairs.n_lights), np.bool_)
     store = open_samples(projection.location)
     unit = float(store.attrs[UNIT])
     peaks, brightest, darkest = np.zeros(len(photographs), np.float32), 0.0, 0.0
@@ -257,7 +256,7 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
             counts[i] += _counts_of(kinds)
             is_known = np.asarray(IS_KNOWN[kinds].any(axis=2)) if kinds.any() else None
             for j, light in enumerate(lights[first + some]):
-                measured[light, seen if is_known is None else seen[is_known[:, j]]] = True
+                measured[seen if is_known is None else seen[is_known[:, j]], light] = True
             brightest = max(brightest, float(np.fmax.reduce(values, axis=None, initial=0.0)))
             darkest = min(darkest, float(np.fmin.reduce(values, axis=None, initial=0.0)))
     store[:, photographs.start : photographs.stop] = block
@@ -265,7 +264,7 @@ def project_chunk(projection: Projection, photographs: range) -> dict[str, NDArr
         "photographs": np.array(len(photographs)),
         "views": of_block,
         "values": counts,
-        "measured": np.packbits(measured.T, axis=1),
+        "measured": np.packbits(measured, axis=1),
         "brightest": np.array(brightest),
         "darkest": np.array(darkest),
         "peaks": peaks,
