@@ -177,6 +177,21 @@ def test_a_graph_joins_texels_that_face_the_same_way():
     np.testing.assert_allclose(graph.laplacian() @ np.ones(4), 0)
 
 
+def test_all_around_is_true_where_all_neighbours_are(small_rng):
+    positions = small_rng.random((60, 3))
+    graph = texel_graph(positions, np.tile([0.0, 0, 1], (60, 1)))
+    true = small_rng.random((60, 19)) < 0.8
+    near = graph.adjacency.toarray() > 0
+    expected = true & np.array([true[row].all(axis=0) for row in near])
+    assert 0 < expected.sum() < true.sum()
+    np.testing.assert_array_equal(graph.all_around(true), expected)
+    # Each pair once, the lower number first.
+    pairs = graph.pairs.tolist()
+    assert all(low < high for low, high in pairs)
+    assert len({tuple(pair) for pair in pairs}) == len(pairs) == near.sum() / 2
+    assert sorted(pairs) == pairs
+
+
 def test_texels_on_both_sides_of_a_sharp_edge_are_no_neighbours():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, -1]])
     normals = np.array([[0.0, 0, 1], [0, 0, 1], [1, 0, 0]])

@@ -387,6 +387,12 @@ def test_one_wrong_view_does_not_eat_a_surface_away():
     assert level(most) == pytest.approx(-0.3, abs=0.01)  # the blur, again
 
 
+def test_threads_carve_the_same(rng):
+    seen = seen_planes([0.1] * 5, 0.02, rng)
+    one, three = (carved_by_depths(FULL, GRID, seen, workers) for workers in (1, 3))
+    np.testing.assert_array_equal(one, three)
+
+
 def test_what_no_view_sees_stays_and_nothing_grows():
     unseen = seen_planes([0.1])
     unseen[0] = replace(unseen[0], depth=np.full((20, 20), np.nan))

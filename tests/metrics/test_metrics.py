@@ -314,6 +314,38 @@ def test_no_frame_is_refused():
         compare_images([])
 
 
+def test_wide_backdrops_change_nothing_but_time(frames, rounding):
+    """Only rows and columns around the object are looked at."""
+    apart = [
+        replace(pair, excluded=np.arange(1600).reshape(40, 40) % 97 == 0) for pair in frames
+    ]
+
+    def padded(image, fill):
+        widths = ((70, 20), (5, 90)) + ((0, 0),) * (image.ndim - 2)
+        return np.pad(image, widths, constant_values=fill)
+
+    wide = [
+        replace(
+            pair,
+            photograph=padded(pair.photograph, 0.7),
+            relit=padded(pair.relit, 3.0),
+            silhouette=padded(pair.silhouette, 0.0),
+            excluded=padded(pair.excluded, True),
+        )
+        for pair in apart
+    ]
+    near, far = compare_images(apart), compare_images(wide)
+    for name in ("psnr_ldr", "psnr_hdr", "ssim", "flip", "n_pixels"):
+        # FLIP is single precision, its filters' sums begin elsewhere.
+        assert far.mean[name] == pytest.approx(near.mean[name], rel=1e-5)
+    errors, around = flip_errors(apart[0], 1.0), flip_errors(wide[0], 1.0)
+    filters = rounding(np.float32, operations=2 * 2 * 21)
+    assert np.abs(around[70:110, 5:45] - errors).max() < filters
+    outside = np.ones(around.shape, bool)
+    outside[70 - 32 : 110 + 32, : 45 + 32] = False
+    assert not around[outside].any()
+
+
 def test_strips_measure_what_whole_frames_do(frames, monkeypatch, rng, rounding):
     """FLIP reaches 10 pixels, SSIM 3; a strip of 32 rows sees 32 more on both sides."""
     tall = [

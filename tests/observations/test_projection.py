@@ -8,9 +8,10 @@ import pytest
 from reflfield.capture.cameras import Camera, looking_at
 from reflfield.capture.capture import Capture
 from reflfield.capture.image_writing import write_exr, write_png
-from reflfield.capture.lights import Light
+from reflfield.capture.lights import Light, facing_irradiance
 from reflfield.capture.photographs import Exposure, Photograph
 from reflfield.errors import InputError, ShapeError
+from reflfield.metrics.held_out_photographs import mean_sample
 from reflfield.observations import store
 from reflfield.observations.bilinear_sampling import sample_bilinear
 from reflfield.observations.image_projection import (
@@ -18,10 +19,10 @@ from reflfield.observations.image_projection import (
     USUAL_SAMPLE,
     Projection,
     directions_of,
-    facing_irradiance,
     look_into,
     project_chunk,
     project_photographs,
+    shines,
 )
 from reflfield.observations.photographed_pairs import PhotographedPairs
 from reflfield.observations.store import ObservationStore, Observed
@@ -382,3 +383,38 @@ def test_the_photographs_looked_into_show_every_light(capture_of, tmp_path):
     shown = [capture.photographs[i] for i in look.photograph]
     assert {p.light for p in shown} == set(range(6))
     assert len({p.camera for p in shown}) >= 6
+
+
+def test_means_of_samples_leave_out_what_was_not_measured(rng):
+    values = rng.random((5, 7, 3)).astype(np.float16)
+    observed = rng.random((5, 7)) < 0.6
+    observed[0] = False
+    for gaps in (False, True):
+        if gaps:
+            values[rng.random(values.shape) < 0.3] = np.nan
+        means = mean_sample(values, observed)
+        for i in range(5):
+            for c in range(3):
+                counted = values[i, observed[i], c].astype(float)
+                counted = counted[~np.isnan(counted)]
+                expected = counted.mean() if len(counted) else np.nan
+                # Sums of seven single-precision numbers below 1.
+                np.testing.assert_allclose(means[i, c], expected, rtol=1e-6)
+    assert np.isnan(means[0]).all()
+
+
+def test_colours_that_lights_have_are_those_of_their_irradiance():
+    spot = Light(
+        "spot", "spot", position=np.array([0.0, 0, 1]), direction=np.array([0.0, 0, -1]),
+        intensity=np.array([1.0, 0, 1]), cone_angle=0.5, falloff_angle=0.1,
+    )  # fmt: skip
+    lights = (
+        Light("off", "point", position=np.array([0.0, 1, 1]), intensity=np.zeros(3)),
+        Light("red", "directional", intensity=np.array([1.0, 0, 0])),
+        spot,
+        Light("unknown", "unknown"),
+    )
+    points = np.random.default_rng(1).uniform(-1, 1, (40, 3)) * [1, 1, 0.2]
+    found = shines(lights, points)
+    np.testing.assert_array_equal(found, facing_irradiance(lights, points) > 0)
+    assert 0 < found[:, 2, 0].sum() < 40

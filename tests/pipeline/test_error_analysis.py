@@ -1,6 +1,7 @@
 """Baselines and kinds of errors of a run and of `compare`: in metrics, console and page."""
 
 import json
+import tomllib
 import weakref
 from types import SimpleNamespace
 
@@ -10,9 +11,10 @@ import pytest
 from reflfield.capture.readers import open_capture
 from reflfield.metrics.error_kinds import KINDS
 from reflfield.metrics.image_errors import PSNR_CAP_DB, psnr
-from reflfield.options import HoldOut
-from reflfield.pipeline import error_analysis
+from reflfield.options import HoldOut, with_tables
+from reflfield.pipeline import comparison, error_analysis
 from reflfield.pipeline.hold_out import split_of
+from reflfield.pipeline.pipeline_options import PipelineOptions
 from reflfield.render.exposure import display, object_pixels
 
 DB = 10 / np.log(10)  # decibels of a relative error of a mean square
@@ -129,3 +131,23 @@ def test_one_image_of_a_baseline_is_held_at_a_time():
     analyser = error_analysis.Analyser(baselines, None)
     error_analysis._analyse_one(analyser, pairs, 0, scores, None)
     assert len(made) == 2
+
+
+def test_photographs_analysed_side_by_side_give_the_same(
+    finished, tiny_capture, tiny_options, context_of, tmp_path
+):
+    options = with_tables(PipelineOptions(), tomllib.loads(tiny_options.read_text()))
+    context = context_of(open_capture(tiny_capture), finished.folder, options)
+    analyser = error_analysis.analyser_of(context)
+    pairs = comparison.relit_pairs(context)["truth"]
+    compared = comparison.comparison_of(context, "truth")
+    assert len(pairs) > 1
+    found = []
+    for at_once in (1, 3):
+        (tmp_path / str(at_once)).mkdir()
+        found.append(
+            error_analysis.analyse(analyser, pairs, compared, tmp_path / str(at_once), at_once)
+        )
+    assert found[0] == found[1]
+    names = [image["name"] for image in found[1]["baselines"]["black"]["images"]]
+    assert names == [photograph.name for photograph in pairs.capture.photographs]

@@ -286,6 +286,15 @@ def test_photographs_are_left_out_before_pixels(n_pixels, n_lights, memory):
     ) == pytest.approx(1)
 
 
+def test_less_effort_takes_a_share_of_what_time_limits():
+    n_pixels, n_values = 3_000_000, 450_000_000
+    whole = shares_within(n_pixels, n_values, 1e12)
+    half = shares_within(n_pixels, n_values, 1e12, effort=0.5)
+    assert half.values == pytest.approx(0.5 * whole.values)
+    # What is small is taken whole.
+    assert shares_within(1000, 30_000, 1e12, effort=0.5) == (1.0, 1.0)
+
+
 def test_photographs_of_a_view_are_spread_evenly():
     photographs = np.arange(40, 70)
     np.testing.assert_array_equal(spread_over(photographs, 1.0, 7), photographs)
