@@ -240,7 +240,7 @@ def _with_candidates(
 ) -> Iterable[PlannedStage]:
     """The stages, and before them what the fields that are not selected take."""
     for stage in planned:
-        if stage.name in ("indirect", "completion") and counts.n_fits > 1:
+        if stage.name in ("indirect", "surface", "completion") and counts.n_fits > 1:
             others = [s for s in planned if s.name in ("compression", "comparison")]
             extra = [_planned(s.name, context, counts, costs, slower) for s in others]
             yield PlannedStage(
