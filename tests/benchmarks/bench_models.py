@@ -11,7 +11,8 @@ measured woven satin. By name only, with results of their own: the vase of the d
 Scenes are in `scenes/`; `painted_bob` and `woven_bob` need mesh and material of the test data
 (REFLFIELD_DATA). Every field is made by ``reflfield run`` with default options but for the
 model, and compared with held-out photographs and with those of views and lights that are not in
-the capture. Beside it is the lumigraph over all photographs: the nearest one, carried over the surface.
+the capture. Beside it is the lumigraph over all photographs: the nearest one, carried over
+the surface.
 
 Writes results/models.json, of a vase results/models_VASE.json.
 """
