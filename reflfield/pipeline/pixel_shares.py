@@ -14,8 +14,8 @@ Indices = NDArray[np.intp]
 # Pixels under a light, and pixels with the texels under them, that are fitted to at most: more
 # would take hours, or minutes.
 MOST_PIXELS, MOST_FOOTPRINTS = 12_000_000, 1_500_000
-# Of these limits, for the fit on a hull whose surface then moves: normals and where to start
-# from are all that is taken from it.
+# Share of these limits for the fit on a hull that is then moved: only its normals, and where
+# the next fit begins, are taken from it.
 HULL_EFFORT = 0.5
 # Photographs of each view that are fitted to at least, before pixels are left out: neighbouring
 # texels under one pixel are told apart by many pixels, not by many lights.

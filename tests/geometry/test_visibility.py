@@ -317,3 +317,25 @@ def test_facing_is_the_cosine_of_rays_and_normals():
     parallel = replace(camera, kind="orthographic", fl_x=20.0, fl_y=20.0)
     # A ray beside the middle by half a pixel of 1/20.
     assert scene.facing(parallel)[15, 20] == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize("band", [0.5, 1.0, 1.5, 2.0, 3.3])
+def test_edges_reach_as_far_as_their_band(band):
+    """Pixels whose centres are within the band of the line between two that differ."""
+    square = Mesh([[1, 1, 4], [2, 1, 4], [2, 2, 4], [1, 2, 4]], [[0, 2, 1], [0, 3, 2]])
+    camera = Camera("v", "opencv", 60, 48, 64.0, 64.0, 0.5, 0.5, np.eye(4))
+    scene = RayScene(square)
+    covered = scene.silhouette(camera)
+    beside = np.zeros(covered.shape, bool)
+    for axis in (0, 1):
+        differs = np.diff(covered, axis=axis)
+        ahead = [(0, 0), (0, 0)]
+        for side in ((0, 1), (1, 0)):
+            ahead[axis] = side
+            beside |= np.pad(differs, ahead)
+    y, x = np.nonzero(beside)
+    rows, columns = np.mgrid[:48, :60]
+    away = np.hypot(rows[..., None] - y, columns[..., None] - x).min(axis=2)
+    edges = depth_edges(scene, camera, VisibilityOptions(edge_band=band))
+    assert 0 < edges.sum() < edges.size / 2
+    np.testing.assert_array_equal(edges, away + 0.5 <= band)
